@@ -1,4 +1,4 @@
-"""Reading of image files, and one crop and resize applied to everything that belongs to a frame."""
+"""Reading and writing of image files: colour, masks, depth."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import struct
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,15 +14,13 @@ from jaxtyping import Bool, Float, UInt8
 
 from data_catalog.inside import inside
 from extrags.array_files import load_npy
-from extrags.config import IngestConfig
-from extrags.errors import ConfigError, SourceError, SourceNotFoundError
+from extrags.errors import SourceError, SourceNotFoundError
 from extrags.events import Progress, emit
 from extrags.sequence import EndoscopicSequence
 
 __all__ = [
     "COLOUR_SUFFIXES",
     "UPRIGHT",
-    "Resampling",
     "bits_per_value",
     "check_links",
     "colour_files",
@@ -49,8 +46,6 @@ COLOUR_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 _MASK_THRESHOLD = 127
 _LOSSY_SUFFIXES = (".jpg", ".jpeg")
 """Their black is not all of one value: they hold no labels."""
-# Neighbouring depths that differ by more than this share lie on different surfaces.
-_FOLD_STEP = 0.05
 
 
 def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
@@ -294,156 +289,6 @@ def spread(count: int, at_most: int | None) -> list[int]:
     if at_most is None or count <= at_most:
         return list(range(count))
     return [int(k) for k in np.round(np.linspace(0, count - 1, at_most))]
-
-
-@dataclass(frozen=True)
-class Resampling:
-    """Crop a box out of an image, then shrink it; the same for everything that belongs to a frame.
-
-    Args:
-        source_width: size of the images on disk.
-        source_height: size of the images on disk.
-        left: first column kept.
-        top: first row kept.
-        crop_width: columns kept.
-        crop_height: rows kept.
-        width: columns of the result.
-        height: rows of the result.
-    """
-
-    source_width: int
-    source_height: int
-    left: int
-    top: int
-    crop_width: int
-    crop_height: int
-    width: int
-    height: int
-
-    @classmethod
-    def planned(
-        cls,
-        source_width: int,
-        source_height: int,
-        config: IngestConfig,
-        usual_downscale: int = 1,
-        box: tuple[int, int, int, int] | None = None,
-    ) -> Resampling:
-        """Decide crop and size from the settings.
-
-        A whole divisor crops the few columns and rows that do not fill a block of pixels, right and bottom.
-
-        Args:
-            source_width: size of the images on disk.
-            source_height: size of the images on disk.
-            config: `width` and `height`, or `downscale`, or `size`.
-            usual_downscale: divisor of thumbnails.
-            box: left, top, width and height to keep; None keeps all.
-
-        Raises:
-            ConfigError: a size that is larger than the source, too small, or of another proportion.
-        """
-        left, top, crop_width, crop_height = box or (0, 0, source_width, source_height)
-        if config.width is None:
-            if config.height is not None:
-                raise ConfigError("ingest.height needs ingest.width")
-            divisor = config.downscale or (usual_downscale if config.size == "thumbnail" else 1)
-            width, height = crop_width // divisor, crop_height // divisor
-            crop_width, crop_height = width * divisor, height * divisor
-        else:
-            width = config.width
-            proportional = crop_height * width / crop_width
-            height = config.height or round(proportional)
-            if abs(height - proportional) > max(1.0, 0.02 * proportional):
-                raise ConfigError(
-                    f"ingest.width = {width} and ingest.height = {height} would squeeze an image of "
-                    f"{crop_width} x {crop_height} pixels; give the width alone ({round(proportional)} rows)"
-                )
-        if width > crop_width or height > crop_height:
-            raise ConfigError(
-                f"{width} x {height} pixels is larger than the source's {crop_width} x {crop_height}"
-            )
-        if width < 16 or height < 16:
-            raise ConfigError(f"an image of {width} x {height} pixels is too small; expected 16 x 16 or more")
-        return cls(source_width, source_height, left, top, crop_width, crop_height, width, height)
-
-    def intrinsics(self, K: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
-        """K of the result; pixel edges stay where they are (centres at +0.5)."""
-        moved = K.copy()
-        moved[0, 2] -= self.left
-        moved[1, 2] -= self.top
-        moved[0] *= self.width / self.crop_width
-        moved[1] *= self.height / self.crop_height
-        return moved
-
-    def colour(
-        self, image: UInt8[np.ndarray, "h w 3"], *, file: object = None, frame: object = None
-    ) -> UInt8[np.ndarray, "h2 w2 3"]:
-        """Area-averaged colours.
-
-        Raises:
-            SourceError: the image is not of the sequence's size.
-        """
-        import cv2
-
-        crop = self._cropped(image, "rgb", file, frame)
-        return np.asarray(cv2.resize(crop, (self.width, self.height), interpolation=cv2.INTER_AREA))
-
-    def mask(
-        self, mask: Bool[np.ndarray, "h w"], *, file: object = None, frame: object = None
-    ) -> Bool[np.ndarray, "h2 w2"]:
-        """True where every source pixel below is true.
-
-        Raises:
-            SourceError: the mask is not of the sequence's size.
-        """
-        import cv2
-
-        crop = self._cropped(mask, "mask", file, frame).astype(np.float32)
-        share = cv2.resize(crop, (self.width, self.height), interpolation=cv2.INTER_AREA)
-        return np.asarray(share > 0.999)
-
-    def depth(
-        self, depth: Float[np.ndarray, "h w"], *, file: object = None, frame: object = None
-    ) -> Float[np.ndarray, "h2 w2"]:
-        """Depth at the new pixel centres, never mixed across a fold.
-
-        Where the four neighbours are known and close, their inverse depth is interpolated (exact on a
-        plane); elsewhere the nearest value is taken. 0 stays unknown.
-
-        Raises:
-            SourceError: the depth map is not of the sequence's size.
-        """
-        crop = self._cropped(depth, "depth", file, frame)
-        if (self.width, self.height) == (self.crop_width, self.crop_height):
-            # The new pixels are the old ones: the same numbers, in a fortieth of the time.
-            return crop.astype(np.float32)
-        x = (np.arange(self.width) + 0.5) * self.crop_width / self.width - 0.5
-        y = (np.arange(self.height) + 0.5) * self.crop_height / self.height - 0.5
-        i = np.clip(np.floor(y).astype(int), 0, max(self.crop_height - 2, 0))
-        j = np.clip(np.floor(x).astype(int), 0, max(self.crop_width - 2, 0))
-        a = np.clip(y - i, 0, 1)[:, None]
-        b = np.clip(x - j, 0, 1)[None, :]
-        corners = np.stack([crop[np.ix_(i + down, j + right)] for down in (0, 1) for right in (0, 1)]).astype(
-            np.float64
-        )
-        weights = np.stack([(1 - a) * (1 - b), (1 - a) * b, a * (1 - b), a * b])
-        nearest = np.take_along_axis(corners, weights.argmax(axis=0)[None], axis=0)[0]
-        low, high = corners.min(axis=0), corners.max(axis=0)
-        one_surface = (low > 0) & (high <= low * (1 + _FOLD_STEP))
-        inverse = (weights / np.where(corners > 0, corners, 1)).sum(axis=0)
-        return np.asarray(np.where(one_surface, 1 / np.maximum(inverse, 1e-12), nearest), dtype=np.float32)
-
-    def _cropped(self, array: np.ndarray, field: str, file: object, frame: object) -> np.ndarray:
-        if array.shape[:2] != (self.source_height, self.source_width):
-            raise SourceError(
-                f"{array.shape[1]} x {array.shape[0]} pixels; "
-                f"expected {self.source_width} x {self.source_height} as in the first frame",
-                file=file,
-                frame=frame,
-                field=field,
-            )
-        return array[self.top : self.top + self.crop_height, self.left : self.left + self.crop_width]
 
 
 def _stored_numbers(file: Path, frame: object) -> np.ndarray:

@@ -11,7 +11,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from data_catalog.images import Resampling
+from data_catalog.resampling import Resampling
 from extrags.cameras import field_mask
 from extrags.config import IngestConfig
 from extrags.errors import ConfigError, SourceError

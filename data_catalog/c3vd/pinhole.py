@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from data_catalog.c3vd.scaramuzza import ScaramuzzaCamera
-from data_catalog.images import Resampling
+from data_catalog.resampling import Resampling
 from data_catalog.sampling import LensSampling, Sampling, keeps_central_resolution, source_areas
 from extrags.cameras import unproject_pixels
 from extrags.config import IngestConfig

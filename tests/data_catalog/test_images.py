@@ -10,7 +10,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from data_catalog.images import UPRIGHT, orientation, read_colour, read_depth, read_mask
+from data_catalog.images import (
+    UPRIGHT,
+    natural_key,
+    orientation,
+    read_colour,
+    read_depth,
+    read_mask,
+    spread,
+)
 from extrags.errors import SourceError
 
 GREY = np.random.default_rng(0).integers(0, 2**16, (20, 30), dtype=np.uint16)
@@ -170,3 +178,13 @@ class TestMasks:
     def test_black_of_a_jpeg_is_not_all_of_one_value(self, tmp_path: Path) -> None:
         noise = np.random.default_rng(0).integers(0, 6, (20, 30), dtype=np.uint8)
         assert not read_mask(written(tmp_path / "a.jpg", noise)).any()
+
+
+def test_natural_order() -> None:
+    names = ["f10.png", "f9.png", "f09b.png", "f1.png", "a.png"]
+    assert sorted(names, key=natural_key) == ["a.png", "f1.png", "f9.png", "f09b.png", "f10.png"]
+
+
+def test_spread_keeps_both_ends() -> None:
+    assert spread(5, None) == [0, 1, 2, 3, 4]
+    assert spread(100, 3) == [0, 50, 99]

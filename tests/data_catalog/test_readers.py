@@ -11,10 +11,9 @@ from PIL import Image
 
 from data_catalog.catalog import read, source_fingerprint
 from data_catalog.content import view_mask
-from data_catalog.images import Resampling, natural_key, spread
 from data_catalog.readers.sinus import read_points, read_view_names
 from extrags.config import IngestConfig
-from extrags.errors import ConfigError, PoseError, SourceError, SourceNotFoundError
+from extrags.errors import PoseError, SourceError, SourceNotFoundError
 
 
 class TestSinus:
@@ -408,62 +407,3 @@ class TestPosedFolder:
         sequence = read(posed_folder)
         assert sequence.depth_mm is None
         assert sequence.observed is None
-
-
-class TestResampling:
-    def test_depth_of_a_slanted_plane_is_exact(self) -> None:
-        """z-depth of a plane is linear in inverse depth: shrinking must not bend it."""
-        focal, size = 60.0, 96
-        u = (np.arange(size) + 0.5 - size / 2) / focal
-        plane = (20 / (1 + 0.4 * u[None, :] + 0.2 * u[:, None])).astype(np.float32)
-        plan = Resampling.planned(size, size, IngestConfig(width=40))
-        v = (np.arange(40) + 0.5 - 20) / (focal * 40 / size)
-        expected = 20 / (1 + 0.4 * v[None, :] + 0.2 * v[:, None])
-        np.testing.assert_allclose(plan.depth(plane), expected, rtol=1e-5)
-
-    def test_depth_is_not_mixed_across_a_fold(self) -> None:
-        depth = np.full((32, 32), 10, np.float32)
-        depth[:, 15:] = 30
-        depth[5, 5] = 0
-        small = Resampling.planned(32, 32, IngestConfig(downscale=2)).depth(depth)
-        assert set(np.unique(small)) <= {0.0, 10.0, 30.0}
-
-    def test_depth_of_frames_that_are_not_shrunk_stays_as_it_is(self) -> None:
-        depth = np.random.default_rng(0).uniform(0, 30, (40, 48)).astype(np.float32)
-        depth[depth < 3] = 0
-        plan = Resampling.planned(48, 40, IngestConfig(size="source"), box=(3, 5, 32, 30))
-        np.testing.assert_array_equal(plan.depth(depth), depth[5:35, 3:35])
-
-    def test_crop_moves_the_principal_point(self) -> None:
-        plan = Resampling.planned(100, 90, IngestConfig(downscale=2), box=(10, 6, 61, 70))
-        assert (plan.width, plan.height, plan.crop_width) == (30, 35, 60)
-        K = np.array([[80.0, 0, 50], [0, 80, 45], [0, 0, 1]])
-        np.testing.assert_allclose(plan.intrinsics(K), [[40, 0, 20], [0, 40, 19.5], [0, 0, 1]])
-
-    def test_mask_needs_every_pixel_below(self) -> None:
-        mask = np.ones((32, 32), bool)
-        mask[3, 3] = False
-        small = Resampling.planned(32, 32, IngestConfig(downscale=2)).mask(mask)
-        assert not small[1, 1]
-        assert small.sum() == 255
-
-    @pytest.mark.parametrize(
-        ("settings", "message"),
-        [
-            ({"width": 64, "height": 20}, "would squeeze"),
-            ({"width": 200}, "larger than the source"),
-            ({"downscale": 8}, "too small"),
-            ({"height": 32}, "needs ingest.width"),
-        ],
-    )
-    def test_impossible_sizes(self, settings, message) -> None:
-        with pytest.raises(ConfigError, match=message):
-            Resampling.planned(100, 100, IngestConfig(**settings))
-
-    def test_natural_order(self) -> None:
-        names = ["f10.png", "f9.png", "f09b.png", "f1.png", "a.png"]
-        assert sorted(names, key=natural_key) == ["a.png", "f1.png", "f9.png", "f09b.png", "f10.png"]
-
-    def test_spread_keeps_both_ends(self) -> None:
-        assert spread(5, None) == [0, 1, 2, 3, 4]
-        assert spread(100, 3) == [0, 50, 99]

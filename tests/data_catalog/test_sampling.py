@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from data_catalog.images import Resampling
+from data_catalog.resampling import Resampling
 from data_catalog.sampling import LensSampling, source_areas
 from extrags.config import IngestConfig
 from extrags.errors import ConfigError, SourceError
