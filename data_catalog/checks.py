@@ -10,30 +10,36 @@ what takes several frames. What is readable but questionable is reported by `dat
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from data_catalog.plausible_intrinsics import another_size
 from extrags.cameras import invert_poses, project_points, transform_points, unproject_pixels
 from extrags.errors import PoseError, SourceError
 from extrags.sequence import EndoscopicSequence
 from extrags.sequence_checks import check_arrays, check_depth, check_intrinsics, check_pose
 
 __all__ = [
-    "axis_readings",
+    "USUAL_MISTAKES",
     "check_axes",
     "check_depth",
     "check_depth_scale",
     "check_intrinsics",
     "check_pose",
     "check_sequence",
+    "depth_disagreement",
     "neighbouring_frames",
-    "reading_name",
+    "other_readings",
 ]
 
+USUAL_MISTAKES = 3
+"""How many of `other_readings`, the first ones, are mistakes that people make."""
 # Below this depth re-projection error (relative, median) poses are right. Another reading of the axes is
-# named as the likely mistake when its error is small, and a small share of the error as given.
+# named as the likely mistake when its error is small, and a small share of the error as given. Where cameras
+# move little, some of 48 readings fits better than the right one by chance.
 _SUSPICIOUS_ERROR = 0.03
 _CONVINCING_ERROR = 0.10
 _CLEARLY_BETTER = 0.35
@@ -86,11 +92,13 @@ def check_axes(sequence: EndoscopicSequence, *, file: object = None) -> None:
 
     Depth of one frame, carried to the next one by their poses, must meet that frame's depth. Where it does
     not, every other reading of the axes (24 proper ones, and the inverse) is tried; one that fits much
-    better is named in the message. Without depth, or with hardly any motion, nothing can be told.
+    better is named in the message, the usual mistakes before all others. Without depth, or with hardly any
+    motion, nothing can be told.
 
     Raises:
         PoseError: another reading of the axes fits the depth much better.
-        SourceError: the mask keeps what is no tissue; outside of it the poses fit as they are.
+        SourceError: K is that of an image of another size; or the mask keeps what is no tissue, and outside
+            of it the poses fit as they are.
     """
     if sequence.world_from_camera is None or sequence.depth_mm is None:
         return
@@ -101,24 +109,19 @@ def check_axes(sequence: EndoscopicSequence, *, file: object = None) -> None:
     as_given = _reprojection_error(sequence, poses, pairs)
     if as_given < _SUSPICIOUS_ERROR:
         return
-    best_error, best_name = as_given, ""
-    for axes in axis_readings():
-        turn = np.eye(4)
-        turn[:3, :3] = axes
-        for inverted, base in ((False, poses), (True, invert_poses(poses))):
-            if not inverted and np.array_equal(axes, np.eye(3)):
-                continue
-            error = _reprojection_error(sequence, base @ turn, pairs)
-            if error < best_error:
-                best_error, best_name = error, reading_name(axes, inverted)
+    _refuse_intrinsics_of_another_size(sequence, as_given, file)
+    fits = [(_reprojection_error(sequence, read, pairs), name) for name, read in other_readings(poses)]
+    best_error, _ = min(fits)
     # Along a narrow part of the image another reading fits by chance, though not as well as the right one.
     convincing = _CONVINCING_ERROR if _are_wide(sequence, pairs) else _SUSPICIOUS_ERROR
     if best_error < min(_CLEARLY_BETTER * as_given, convincing):
         if _is_proven_outside(sequence, pairs, file):
             return
+        usual = [fit for fit in fits[:USUAL_MISTAKES] if fit[0] < _SUSPICIOUS_ERROR]
+        error, name = min(usual or fits)
         raise PoseError(
             f"the poses contradict the depth: carried from frame to frame it is off by {as_given:.0%} "
-            f"(median), but only by {best_error:.1%} when the poses are read as {best_name}. "
+            f"(median), but only by {error:.1%} when the poses are read as {name}. "
             "Expected OpenCV axes (x right, y down, z forward), camera to world",
             file=file,
             field="world_from_camera",
@@ -133,8 +136,9 @@ def check_depth_scale(sequence: EndoscopicSequence, *, file: object = None) -> N
     nothing, and where cameras move little any large factor fits as well as no motion: that is no unit.
 
     Raises:
-        SourceError: another factor, at least 1.5 times more or less, fits much better; or the mask keeps
-            what is no tissue, and outside of it depth and poses fit as they are.
+        SourceError: another factor, at least 1.5 times more or less, fits much better; or K is that of an
+            image of another size; or the mask keeps what is no tissue, and outside of it depth and poses fit
+            as they are.
         PoseError: no motion at all fits much better, and no factor much better than that.
     """
     if sequence.world_from_camera is None or sequence.depth_mm is None:
@@ -146,6 +150,8 @@ def check_depth_scale(sequence: EndoscopicSequence, *, file: object = None) -> N
     as_given = _reprojection_error(sequence, poses, pairs)
     if as_given < _SUSPICIOUS_ERROR:
         return
+
+    _refuse_intrinsics_of_another_size(sequence, as_given, file)
 
     def error_with(factor: float) -> float:
         # Depth times a factor beside these poses is this depth beside poses that move by less.
@@ -160,6 +166,8 @@ def check_depth_scale(sequence: EndoscopicSequence, *, file: object = None) -> N
         return
     if _is_proven_outside(sequence, pairs, file):
         return
+    nearest = min(_KNOWN_FACTORS, key=lambda known: abs(np.log(known / factor)))
+    hint = f", as of {_KNOWN_FACTORS[nearest]}" if abs(np.log(nearest / factor)) < 0.2 else ""
     still = error_with(np.inf)
     if best >= _CLEARLY_BETTER * still and still < min(_CLEARLY_BETTER * as_given, _CONVINCING_ERROR):
         if not _are_wide(sequence, pairs):
@@ -167,13 +175,12 @@ def check_depth_scale(sequence: EndoscopicSequence, *, file: object = None) -> N
         raise PoseError(
             f"the positions of the cameras contradict the depth: carried from frame to frame it is off by "
             f"{as_given:.0%} (median), but only by {still:.1%} if the cameras did not move at all (by "
-            f"{best:.1%} when it is multiplied by about {factor:.3g}, which so little motion cannot tell). "
+            f"{best:.1%} when it is multiplied by about {factor:.3g}{hint}, which so little motion cannot "
+            "tell). "
             "Expected positions of cameras in the world, in the unit of the depth",
             file=file,
             field="world_from_camera",
         )
-    nearest = min(_KNOWN_FACTORS, key=lambda known: abs(np.log(known / factor)))
-    hint = f", as of {_KNOWN_FACTORS[nearest]}" if abs(np.log(nearest / factor)) < 0.2 else ""
     raise SourceError(
         f"depth and poses are in different units: carried from frame to frame depth is off by "
         f"{as_given:.0%} (median), but only by {best:.1%} when it is multiplied by about "
@@ -181,6 +188,36 @@ def check_depth_scale(sequence: EndoscopicSequence, *, file: object = None) -> N
         file=file,
         field="depth_mm",
     )
+
+
+def depth_disagreement(sequence: EndoscopicSequence) -> float | None:
+    """By how much depth that the poses carry from frame to frame differs from that frame's own, relatively.
+
+    Median over the points of a pair of neighbouring frames, mean over the pairs that overlap.
+
+    Returns:
+        None without poses or depth, and where most neighbours do not overlap.
+    """
+    if sequence.world_from_camera is None or sequence.depth_mm is None:
+        return None
+    pairs = _comparable_pairs(sequence)
+    errors = _pair_errors(sequence, np.asarray(sequence.world_from_camera, dtype=np.float64), pairs)
+    overlapping = [error for error in errors if error is not None]
+    return float(np.mean(overlapping)) if len(overlapping) > len(pairs) / 2 else None
+
+
+def _refuse_intrinsics_of_another_size(sequence: EndoscopicSequence, as_given: float, file: object) -> None:
+    """Where poses and depth contradict each other: before either is blamed, an evident mistake in K is."""
+    for index in range(len(sequence)):
+        problem = another_size(sequence.K[index], sequence.width, sequence.height)
+        if problem is not None:
+            raise SourceError(
+                f"{problem} (with it, depth that the poses carry from frame to frame is off by "
+                f"{as_given:.0%} in the median)",
+                file=file,
+                frame=sequence.frame_name(index),
+                field="K",
+            )
 
 
 def _is_proven_outside(sequence: EndoscopicSequence, pairs: list[tuple[int, int]], file: object) -> bool:
@@ -296,7 +333,29 @@ def _checked_pixels(
     return v.ravel(), u.ravel()
 
 
-def axis_readings() -> list[Float[np.ndarray, "3 3"]]:
+def other_readings(poses: Float[np.ndarray, "f 4 4"]) -> Iterator[tuple[str, Float[np.ndarray, "f 4 4"]]]:
+    """Poses as they may have been meant, each with the name of that reading; all but the given one.
+
+    The usual mistakes come first: world-to-camera, OpenGL axes, and both. Then all other rotations that map
+    axes to axes, and their inverses.
+    """
+    open_gl, open_cv = np.diag([1.0, -1.0, -1.0]), np.eye(3)
+    usual = [(open_cv, True), (open_gl, False), (open_gl, True)]
+    known = [*usual, (open_cv, False)]
+    others = [
+        (axes, inverted)
+        for axes in _axis_rotations()
+        for inverted in (False, True)
+        if not any(inverted == way and np.array_equal(axes, other) for other, way in known)
+    ]
+    inverses = invert_poses(poses)
+    for axes, inverted in [*usual, *others]:
+        turn = np.eye(4)
+        turn[:3, :3] = axes
+        yield _reading_name(axes, inverted), (inverses if inverted else poses) @ turn
+
+
+def _axis_rotations() -> list[Float[np.ndarray, "3 3"]]:
     """The 24 rotations that map axes to axes; OpenGL's flip of y and z is one of them."""
     readings = []
     for order in itertools.permutations(range(3)):
@@ -308,8 +367,8 @@ def axis_readings() -> list[Float[np.ndarray, "3 3"]]:
     return readings
 
 
-def reading_name(axes: Float[np.ndarray, "3 3"], inverted: bool) -> str:
-    """What a user calls a reading of `axis_readings`."""
+def _reading_name(axes: Float[np.ndarray, "3 3"], inverted: bool) -> str:
+    """What a user calls a reading."""
     letters = "xyz"
     parts = []
     for k in range(3):

@@ -13,13 +13,13 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from jaxtyping import Float
 
-from data_catalog.checks import axis_readings, reading_name
+from data_catalog.checks import USUAL_MISTAKES, depth_disagreement, other_readings
 from data_catalog.findings import Finding, warning
 from data_catalog.images import natural_key
 from data_catalog.mask_findings import mask_findings
 from data_catalog.matches import match_neighbours, pose_support
-from data_catalog.sampling import OFF_CENTRE_SHARE
-from extrags.cameras import Cameras, invert_poses, rotation_angle_deg
+from data_catalog.plausible_intrinsics import unlikely
+from extrags.cameras import Cameras, rotation_angle_deg
 from extrags.frame_quantiles import median_of_frames
 from extrags.sequence import EndoscopicSequence, saturated_mask
 
@@ -38,6 +38,8 @@ _JUMP = 8.0
 _CLIPPED_SHARE = 0.02
 _SATURATED_SHARE = 0.6
 _BLACK = 4.0
+# Sources of the catalogue reach 2 %; depth of other frames, mirrored or inverse, 7 to 44 %.
+_DISAGREEMENT = 0.05
 
 
 def diagnose(sequence: EndoscopicSequence, file: str, *, thinned: bool = False) -> list[Finding]:
@@ -87,6 +89,9 @@ def _missing(sequence: EndoscopicSequence) -> Iterator[Finding]:
             continue
         usual = sorted(steps)[len(steps) // 2]
         gaps = [k for k, step in enumerate(steps) if step != usual]
+        if min(steps) < 0:
+            # Another series of frames begins.
+            continue
         if usual > 0 and 0 < len(gaps) <= max(1, len(steps) // 20):
             gap = gaps[0]
             yield warning(
@@ -101,17 +106,25 @@ def _missing(sequence: EndoscopicSequence) -> Iterator[Finding]:
 def _images(sequence: EndoscopicSequence) -> Iterator[Finding]:
     """Duplicates, black frames, swapped channels, overexposure."""
     seen: dict[bytes, int] = {}
+    repeats: list[tuple[int, int]] = []
     for index in range(len(sequence)):
         digest = hashlib.blake2b(sequence.rgb[index].tobytes(), digest_size=16).digest()
         if digest in seen:
-            yield warning(
-                "duplicate frame",
-                f"the same image as frame {sequence.frame_name(seen[digest])}, pixel by pixel; remove one",
-                frame=sequence.frame_name(index),
-                field="rgb",
-            )
-            break
-        seen[digest] = index
+            repeats.append((index, seen[digest]))
+        seen.setdefault(digest, index)
+    if repeats:
+        index, first = repeats[0]
+        several = (
+            f"; {len(repeats)} frames repeat an earlier one: remove them"
+            if len(repeats) > 1
+            else "; remove one"
+        )
+        yield warning(
+            "duplicate frame",
+            f"the same image as frame {sequence.frame_name(first)}, pixel by pixel{several}",
+            frame=sequence.frame_name(index),
+            field="rgb",
+        )
     means = _brightness(sequence)
     for index in np.flatnonzero(means < _BLACK)[:1]:
         yield warning(
@@ -167,36 +180,12 @@ def _exposure(sequence: EndoscopicSequence) -> Iterator[Finding]:
 
 def _intrinsics(sequence: EndoscopicSequence) -> Iterator[Finding]:
     """Intrinsics that are possible but unlikely for images of this size."""
-    width, height = sequence.width, sequence.height
+    if sequence.intrinsics == "guessed":
+        # Of a video's pixels that are told to be wider than high, for instance: not K's own claim.
+        return
     for index in range(len(sequence)):
-        K = sequence.K[index]
-        fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
-        across, down = 2 * cx / width, 2 * cy / height
-        problem = ""
-        if abs(across - down) < 0.1 and (across > 1.4 or across < 0.7):
-            problem = (
-                f"the principal point ({cx:.1f}, {cy:.1f}) is the centre of an image {across:.2g} times as "
-                f"large as this one of {width} x {height} pixels: K belongs to another size. Divide its "
-                f"first two rows by {across:.2g}"
-            )
-        elif (
-            abs(cx - width / 2) > OFF_CENTRE_SHARE * width or abs(cy - height / 2) > OFF_CENTRE_SHARE * height
-        ):
-            problem = (
-                f"the principal point ({cx:.1f}, {cy:.1f}) lies far from the centre of {width} x {height} "
-                "pixels. Was the image cropped, or are cx and cy swapped?"
-            )
-        elif not 1 / 1.15 < fx / fy < 1.15:
-            problem = (
-                f"fx = {fx:.1f} and fy = {fy:.1f} px differ by {abs(fx / fy - 1):.0%}; pixels are nearly "
-                "square in all endoscopes. Was the image squeezed?"
-            )
-        elif (angle := 2 * np.degrees(np.arctan(width / 2 / fx))) > 150 or angle < 15:
-            problem = (
-                f"fx = {fx:.1f} px means a field of view of {angle:.0f} degrees for {width} pixels; "
-                "endoscopes have 40 to 140 as a pinhole. Does fx belong to another image size?"
-            )
-        if problem:
+        problem = unlikely(sequence.K[index], sequence.width, sequence.height)
+        if problem is not None:
             yield warning("intrinsics", problem, frame=sequence.frame_name(index), field="K")
             return
 
@@ -249,18 +238,21 @@ def _poses(sequence: EndoscopicSequence) -> Iterator[Finding]:
         )
         return
     if distance is not None:
-        yield from _parallax(reach, distance)
+        known = sequence.depth_mm is not None
+        yield from _parallax(
+            reach, distance, *(["or look whether poses and depth have the same unit"] if known else [])
+        )
     for members in _recordings(sequence):
         yield from _pose_steps(sequence, members)
 
 
-def _parallax(reach: float, distance: float) -> Iterator[Finding]:
+def _parallax(reach: float, distance: float, cure: str = "or give depth") -> Iterator[Finding]:
     if reach < _MIN_BASELINE_SHARE * distance:
         yield warning(
             "parallax",
             f"the training cameras reach over {reach:.3g}, {reach / distance:.1%} of the distance to the "
             f"scene ({distance:.3g}); expected at least {_MIN_BASELINE_SHARE:.0%}. Too little parallax to "
-            "triangulate; record more motion sideways, or give depth",
+            f"triangulate; record more motion sideways, {cure}",
             field="world_from_camera",
         )
 
@@ -304,15 +296,12 @@ def _points(sequence: EndoscopicSequence) -> Iterator[Finding]:
     as_given = _seen_share(sequence, poses)
     if as_given > 0.15:
         return
-    best, best_name = as_given, ""
-    for axes in axis_readings():
-        turn = np.eye(4)
-        turn[:3, :3] = axes
-        for inverted, base in ((False, poses), (True, invert_poses(poses))):
-            share = _seen_share(sequence, base @ turn)
-            if share > best + 1e-9:
-                best, best_name = share, reading_name(axes, inverted)
-    hint = f", but {best:.0%} when the poses are read as {best_name}" if best > 3 * as_given + 0.1 else ""
+    shares = [(_seen_share(sequence, read), name) for name, read in other_readings(poses)]
+    # Many readings show all points to some camera: the mistakes that people make come first.
+    convincing = 3 * as_given + 0.1
+    usual = [found for found in shares[:USUAL_MISTAKES] if found[0] > convincing]
+    best, best_name = max(usual or shares)
+    hint = f", but {best:.0%} when the poses are read as {best_name}" if best > convincing else ""
     yield Finding(
         kind="error",
         topic="sparse points",
@@ -335,8 +324,12 @@ def _seen_share(sequence: EndoscopicSequence, poses: Float[np.ndarray, "f 4 4"])
 
 
 def _epipolar(sequence: EndoscopicSequence) -> Iterator[Finding]:
-    """Poses that features contradict; needed where there is no depth to contradict them."""
-    if sequence.world_from_camera is None or sequence.depth_mm is not None:
+    """Poses that features contradict.
+
+    Depth contradicts other axes and units, and does not tell poses of other frames from those of a scope that
+    moves little.
+    """
+    if sequence.world_from_camera is None:
         return
     support = pose_support(sequence, match_neighbours(sequence))
     if support.matches < _MIN_MATCHES:
@@ -358,9 +351,23 @@ def _epipolar(sequence: EndoscopicSequence) -> Iterator[Finding]:
             "best): poses or K are wrong, or frames and poses are not in the same order",
             field="world_from_camera",
         )
-    elif sequence.points is None and support.distance > 0:
+    elif sequence.points is None and sequence.depth_mm is None and support.distance > 0:
         reach = float(np.linalg.norm(np.ptp(sequence.cameras.centers[sequence.train], axis=0)))
         yield from _parallax(reach, support.distance)
+
+
+def _disagreement(sequence: EndoscopicSequence) -> Iterator[Finding]:
+    """Depth that poses carry elsewhere than the next frame has it, though no axes and no unit explain it."""
+    error = depth_disagreement(sequence)
+    if error is not None and error > _DISAGREEMENT:
+        yield warning(
+            "depth and poses",
+            f"depth that the poses carry from frame to frame is off by {error:.0%} (median), and neither "
+            "other axes nor another unit explain it; usual are 2% at most. Frames, poses and depth maps may "
+            "not be in the same order; depth may be inverse, of other pixels, or no z-depth; or poses or "
+            "depth are inexact",
+            field="depth_mm",
+        )
 
 
 def _depth(sequence: EndoscopicSequence) -> Iterator[Finding]:
@@ -413,6 +420,7 @@ _CHECKS: tuple[Callable[[EndoscopicSequence], Iterator[Finding]], ...] = (
     _poses,
     _points,
     _epipolar,
+    _disagreement,
     _depth,
 )
 

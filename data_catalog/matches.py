@@ -1,4 +1,4 @@
-"""Consistency of poses with feature matches, for sources without depth to check them.
+"""Consistency of poses with feature matches.
 
 Features are matched between neighbouring frames; a match supports the poses when it lies near its epipolar
 line and its point in front of both cameras. The same is counted for other readings of the axes.
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from data_catalog.checks import axis_readings, neighbouring_frames, reading_name
+from data_catalog.checks import neighbouring_frames, other_readings
 from extrags.cameras import invert_poses, unproject_pixels
 from extrags.sequence import EndoscopicSequence
 
@@ -112,18 +112,14 @@ def pose_support(sequence: EndoscopicSequence, matches: list[FrameMatches]) -> P
     total = sum(len(match.first_px) for match in matches)
     if not total:
         return PoseSupport(0, 0.0, 0.0, "", 0.0)
-    as_given, best, best_name, distance = 0.0, -1.0, "", 0.0
-    for axes in axis_readings():
-        turn = np.eye(4)
-        turn[:3, :3] = axes
-        for inverted, base in ((False, poses), (True, invert_poses(poses))):
-            supporting, depths = _supporting(sequence, base @ turn, matches)
-            share = supporting / total
-            is_given = not inverted and np.array_equal(axes, np.eye(3))
-            if is_given:
-                as_given, distance = share, float(np.median(depths)) if depths.size else 0.0
-            if share > best or (is_given and share >= best):
-                best, best_name = share, "" if is_given else reading_name(axes, inverted)
+    supporting, depths = _supporting(sequence, poses, matches)
+    distance = float(np.median(depths)) if depths.size else 0.0
+    as_given = best = supporting / total
+    best_name = ""
+    for name, read in other_readings(poses):
+        share = _supporting(sequence, read, matches)[0] / total
+        if share > best:
+            best, best_name = share, name
     return PoseSupport(total, as_given, best, best_name, distance)
 
 

@@ -1,0 +1,53 @@
+"""Intrinsics that are possible but unlikely for images of a size."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from data_catalog.sampling import OFF_CENTRE_SHARE
+
+__all__ = ["another_size", "unlikely"]
+
+_ALIKE = 0.1
+"""Both coordinates of a principal point are as far off, to this share of the image's half."""
+_LARGER, _SMALLER = 1.4, 0.7
+_SQUEEZED = 1.15
+_WIDEST_DEG, _NARROWEST_DEG = 150, 15
+
+
+def another_size(K: Float[np.ndarray, "3 3"], width: int, height: int) -> str | None:
+    """What is wrong with K, where its principal point is the centre of an image of another size."""
+    cx, cy = K[0, 2], K[1, 2]
+    across, down = 2 * cx / width, 2 * cy / height
+    if abs(across - down) >= _ALIKE or _SMALLER <= across <= _LARGER:
+        return None
+    return (
+        f"the principal point ({cx:.1f}, {cy:.1f}) is the centre of an image {across:.2g} times as large as "
+        f"this one of {width} x {height} pixels: K belongs to another size. Divide its first two rows by "
+        f"{across:.2g}"
+    )
+
+
+def unlikely(K: Float[np.ndarray, "3 3"], width: int, height: int) -> str | None:
+    """The first thing about K that images of this size hardly ever have; None where it looks right."""
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    if (problem := another_size(K, width, height)) is not None:
+        return problem
+    if abs(cx - width / 2) > OFF_CENTRE_SHARE * width or abs(cy - height / 2) > OFF_CENTRE_SHARE * height:
+        return (
+            f"the principal point ({cx:.1f}, {cy:.1f}) lies far from the centre of {width} x {height} "
+            "pixels. Was the image cropped, or are cx and cy swapped?"
+        )
+    if not 1 / _SQUEEZED < fx / fy < _SQUEEZED:
+        return (
+            f"fx = {fx:.1f} and fy = {fy:.1f} px differ by {abs(fx / fy - 1):.0%}; pixels are nearly "
+            "square in all endoscopes. Was the image squeezed?"
+        )
+    angle = 2 * np.degrees(np.arctan(width / 2 / fx))
+    if angle > _WIDEST_DEG or angle < _NARROWEST_DEG:
+        return (
+            f"fx = {fx:.1f} px means a field of view of {angle:.0f} degrees for {width} pixels; "
+            "endoscopes have 40 to 140 as a pinhole. Does fx belong to another image size?"
+        )
+    return None
