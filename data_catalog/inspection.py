@@ -21,6 +21,7 @@ from data_catalog.specular import specular_masks
 from extrags.config import IngestConfig
 from extrags.errors import ConfigError, ExtragsError, SourceError, UnknownSequenceError
 from extrags.frame_quantiles import quantile_of_frames
+from extrags.observed_surface import never_observed
 from extrags.sequence import EndoscopicSequence, saturated_mask
 
 __all__ = ["Finding", "Inspection", "contact_sheet", "facts", "inspect"]
@@ -146,9 +147,10 @@ def facts(sequence: EndoscopicSequence) -> dict[str, Any]:
             for name, share in (("p1", 0.01), ("median", 0.5), ("p99", 0.99))
         }
     if sequence.observed is not None and len(sequence.test):
-        shown = sum(int(sequence.mask[index].sum()) for index in sequence.test)
         seen = sum(int((sequence.observed[index] & sequence.mask[index]).sum()) for index in sequence.test)
-        result["observed_share"] = seen / max(1, shown)
+        unseen = sum(int(never_observed(sequence, int(index)).sum()) for index in sequence.test)
+        if seen + unseen:
+            result["observed_share"] = seen / (seen + unseen)
     return result
 
 

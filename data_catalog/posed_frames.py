@@ -36,6 +36,7 @@ from extrags.config import IngestConfig
 from extrags.errors import SourceError
 from extrags.events import Progress, emit
 from extrags.frame_stacks import FrameStack, stacked
+from extrags.known_depth import FARTHEST, is_background
 from extrags.lens import Lens
 from extrags.observed_surface import observed_by_depth
 from extrags.radial_lens import RadialLens
@@ -268,6 +269,7 @@ class _Pixels:
         self.depths = FrameStack(count)
         self.brightest = 0
         self.unfinite: dict[Path, int] = {}
+        self.background: dict[Path, int] = {}
         self._depth_steps = DepthSteps()
         # A field of view that was asked for is meant to leave out what is beyond it.
         self._use = LensUse(count) if config.field_of_view_deg is None else None
@@ -318,25 +320,33 @@ class _Pixels:
                 frame=frames[0].label,
                 field="rgb",
             )
-        if self.unfinite:
-            logger.warning(
-                "%s: %d depth values in %d of %d frames, this one first, are NaN or infinite, and taken as "
-                "unknown",
-                next(iter(self.unfinite)),
-                sum(self.unfinite.values()),
-                len(self.unfinite),
-                len(frames),
-            )
+        for counted, what in (
+            (self.unfinite, "are NaN or infinite"),
+            (self.background, f"are over {FARTHEST:g} times as far away as what is near in their image"),
+        ):
+            if counted:
+                logger.warning(
+                    "%s: %d depth values in %d of %d frames, this one first, %s, and taken as unknown",
+                    next(iter(counted)),
+                    sum(counted.values()),
+                    len(counted),
+                    len(frames),
+                    what,
+                )
         if self._use is not None:
             self._use.tell()
 
     def _known(self, depth: Float[np.ndarray, "h w"], file: Path) -> Float[np.ndarray, "h w"]:
-        """Depth with 0 where it is not finite, which is counted."""
+        """Depth with 0 where it is not finite, or a background, which is counted."""
         finite = np.isfinite(depth)
-        if finite.all():
-            return depth
-        self.unfinite[file] = int((~finite).sum())
-        return np.where(finite, depth, np.float32(0))
+        if not finite.all():
+            self.unfinite[file] = int((~finite).sum())
+            depth = np.where(finite, depth, np.float32(0))
+        background = is_background(depth)
+        if background.any():
+            self.background[file] = int(background.sum())
+            depth = np.where(background, np.float32(0), depth)
+        return depth
 
     def lens(self, frames: Sequence[PosedFrame], file: Path) -> RadialLens | None:
         """The lens of all frames that were read; None for pinholes.

@@ -32,6 +32,7 @@ from data_catalog.true_surface import true_surface
 from extrags.cameras import Cameras, pixel_rays
 from extrags.errors import CaptureError
 from extrags.metrics.surface import TrueSurface, sample_triangles
+from extrags.observed_surface import never_observed
 from extrags.sequence import EndoscopicSequence
 from extrags.surface import Mesh
 
@@ -403,7 +404,7 @@ def _unobserved_surface(
     if sequence.observed is not None:
         for frame in sequence.test:
             known = (depth_mm[frame] > 0) & np.isfinite(depth_mm[frame])
-            chosen = known & sequence.mask[frame] & ~sequence.observed[frame]
+            chosen = known & never_observed(sequence, int(frame))
             camera = sequence.cameras[int(frame)]
             along = pixel_rays(camera)[0][chosen]
             hits = rays.cast(camera.centers[0], along)

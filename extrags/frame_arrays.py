@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Real, UInt8
 
 from extrags.errors import ShapeError, SourceError
 from extrags.frame_stacks import stacked
+from extrags.known_depth import is_background
 from extrags.sequence import EndoscopicSequence
 from extrags.sequence_checks import check_arrays, check_pose
 from extrags.splits import Split, every_nth
@@ -41,7 +42,8 @@ def sequence_from_arrays(
         K: intrinsics in pixels, of all frames or of each; pixel centres are at +0.5.
         world_from_camera: camera to world, OpenCV axes (x right, y down, z forward). None: the poses stage
             estimates them.
-        depth_mm: z-depth (not along the ray) in the unit of the poses; 0, NaN and infinity are unknown.
+        depth_mm: z-depth (not along the ray) in the unit of the poses; 0, NaN and infinity are unknown, and
+            so is what is over 1000 times as far away as the near part of its image.
         mask: true where a pixel shows tissue, of all frames or of each; None: everywhere.
         specular: true on specular highlights, which then have no weight in training. None: not known;
             readers look for them, this function does not.
@@ -124,8 +126,9 @@ def _numbers(given: object, what: str) -> np.ndarray:
 
 
 def _without_gaps(depth_mm: np.ndarray) -> np.ndarray:
-    """As float32, 0 where it is not finite."""
+    """As float32, 0 where it is not finite, or a background."""
     if depth_mm.ndim != 3:
         raise ShapeError(f"depth_mm is {depth_mm.dtype} {depth_mm.shape}, expected [F, H, W]")
-    known = (np.where(np.isfinite(depth), depth, 0).astype(np.float32) for depth in depth_mm)
+    finite = (np.where(np.isfinite(depth), depth, 0) for depth in depth_mm)
+    known = (np.where(is_background(depth), 0, depth).astype(np.float32) for depth in finite)
     return stacked(known, len(depth_mm))

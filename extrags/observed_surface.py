@@ -1,4 +1,4 @@
-"""Which pixels of held-out frames show surface that training frames saw, from depth alone."""
+"""Which pixels of held-out frames show surface that training frames saw."""
 
 from __future__ import annotations
 
@@ -8,9 +8,35 @@ from jaxtyping import Bool, Float, Int
 from extrags.cameras import Cameras, pixel_rays
 from extrags.events import Progress, emit
 from extrags.frame_stacks import empty_stack
+from extrags.sequence import EndoscopicSequence
 from extrags.splits import Split
 
-__all__ = ["observed_by_depth", "observed_from_depth"]
+__all__ = ["never_observed", "observed_by_depth", "observed_from_depth"]
+
+
+def never_observed(
+    sequence: EndoscopicSequence, frames: int | Int[np.ndarray, "n"]
+) -> Bool[np.ndarray, "*n h w"]:
+    """Valid pixels of held-out frames that show surface which no training frame saw.
+
+    Pixels without true depth are left out where the sequence has any: nothing tells what they show.
+
+    Args:
+        sequence: with its truth.
+        frames: index of one frame, or indices of several.
+
+    Returns:
+        [H, W] for one frame, [N, H, W] for several; false in training frames, and where the sequence
+        does not know what was observed.
+    """
+    held_out = np.isin(frames, sequence.test)[..., None, None]
+    unseen = np.asarray(sequence.mask[frames] & held_out)
+    if sequence.observed is None:
+        return np.zeros_like(unseen)
+    unseen &= ~sequence.observed[frames]
+    if sequence.true_depth_mm is not None:
+        unseen &= sequence.true_depth_mm[frames] > 0
+    return unseen
 
 
 def observed_from_depth(

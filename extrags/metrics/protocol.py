@@ -31,6 +31,7 @@ from extrags.metrics.photometric import photometric_values
 from extrags.metrics.registry import PROTOCOL_VERSION
 from extrags.metrics.registry import metrics as registered_metrics
 from extrags.metrics.surface import SurfaceErrors, SurfaceResult
+from extrags.observed_surface import never_observed
 from extrags.sequence import EndoscopicSequence
 from extrags.store.storable import Storable
 from extrags.threads import in_threads
@@ -375,10 +376,13 @@ def _parts_of(
     mask = sequence.mask[chosen]
     # The array says nothing about frames that are not held out.
     known = np.isin(chosen, sequence.test) & mask.any((1, 2)) & (sequence.observed is not None)
-    seen = np.zeros_like(mask) if sequence.observed is None else sequence.observed[chosen]
+    seen = np.zeros_like(mask) if sequence.observed is None else mask & sequence.observed[chosen]
+    unseen = never_observed(sequence, chosen)
+    # Nor about frames without any depth.
+    known &= (seen | unseen).any((1, 2))
     smallest = MIN_REGION_SHARE * sequence.height * sequence.width
     parts, shares = {}, {}
-    for name, pixels in (("observed", mask & seen), ("unobserved", mask & ~seen)):
+    for name, pixels in (("observed", seen), ("unobserved", unseen)):
         counts = pixels.sum((1, 2))
         parts[name] = torch.from_numpy(pixels & (known & (counts >= smallest))[:, None, None])
         shares[name] = [

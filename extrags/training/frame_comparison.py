@@ -183,13 +183,16 @@ class ComparedFrames:
         shift = self._K[source] @ motion[:3, 3]
         own = self.depth[frame]
         height, width = own.shape
-        column, row, z = (
-            (self._pixels @ turn[axis]).astype(np.float32) * own + np.float32(shift[axis])
-            for axis in range(3)
-        )
-        positive = z > 1e-9
-        z = np.where(positive, z, 1)
-        column, row = column / z - 0.5, row / z - 0.5
+        with np.errstate(over="ignore", invalid="ignore"):
+            # Depth of a background may be as large as float32 goes: such pixels come to lie nowhere.
+            column, row, z = (
+                (self._pixels @ turn[axis]).astype(np.float32) * own + np.float32(shift[axis])
+                for axis in range(3)
+            )
+            positive = (z > 1e-9) & np.isfinite(z)
+            z = np.where(positive, z, 1)
+            column, row = column / z - 0.5, row / z - 0.5
+            column, row = (np.where(np.isfinite(place), place, np.float32(-1)) for place in (column, row))
         inside = positive & (column >= 0) & (column <= width - 1) & (row >= 0) & (row <= height - 1)
         column, row = column.clip(0, width - 1), row.clip(0, height - 1)
         nearest = np.rint(row).astype(np.intp), np.rint(column).astype(np.intp)

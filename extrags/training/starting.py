@@ -17,6 +17,7 @@ from extrags.frame_quantiles import median_of_frames
 from extrags.frame_stacks import empty_stack, frames_of, stacked
 from extrags.gaussians import Gaussians
 from extrags.illumination import NearFieldLight
+from extrags.known_depth import FARTHEST, is_background
 from extrags.sequence import EndoscopicSequence
 from extrags.sparse_depth import MIN_POINTS_PER_VIEW, interpolated_depth, pixel_lattice
 from extrags.training.random_start import depth_range, random_depth
@@ -156,8 +157,17 @@ def starting_gaussians(
     if count > 10 * max_points:
         drawn = np.sort(generator.choice(count, 10 * max_points, replace=False))
     chosen = _positions(valid, drawn)
-    rays = rays_of_pixels(cameras, chosen)
     z = depth.reshape(-1)[chosen].astype(np.float64)
+    if (background := is_background(z)).any():
+        _log.warning(
+            "%s: %d of %d pixels are over %g times as far away as what is near, and start no Gaussian",
+            sequence.name,
+            int(background.sum()),
+            len(z),
+            FARTHEST,
+        )
+        chosen, z = chosen[~background], z[~background]
+    rays = rays_of_pixels(cameras, chosen)
     view = chosen // (sequence.width * sequence.height)
     points = cameras.centers[view] + z[:, None] * rays
     rgb = _of_frames(sequence.rgb, frames).reshape(-1, 3)[chosen].astype(np.float64) / 255

@@ -110,6 +110,20 @@ class TestFolder:
         told = f"0005.npy: 6 depth values in 2 of {len(whole)} frames, this one first, are NaN or infinite"
         assert told in caplog.text
 
+    @pytest.mark.parametrize("value", [1e10, float(np.finfo(np.float32).max)])
+    def test_a_background_is_unknown(self, posed_folder, caplog, value) -> None:
+        whole = read(posed_folder)
+        file = posed_folder / "depth" / "0005.npy"
+        depth = np.load(file)
+        depth[7, 3:6] = value
+        np.save(file, depth)
+        found = read(posed_folder).depth_mm
+        expected = whole.depth_mm.copy()
+        expected[5, 7, 3:6] = 0
+        np.testing.assert_array_equal(found, expected)
+        told = f"0005.npy: 3 depth values in 1 of {len(whole)} frames, this one first, are over 1000 times"
+        assert told in caplog.text
+
     def test_a_frame_without_any_depth(self, posed_folder) -> None:
         file = posed_folder / "depth" / "0005.npy"
         np.save(file, np.zeros_like(np.load(file)))

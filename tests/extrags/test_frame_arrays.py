@@ -84,10 +84,10 @@ class TestFromArrays:
         np.testing.assert_array_equal(extrags.sequence_from_arrays(floats, K).rgb, given["rgb"])
 
     def test_gaps_in_depth_are_unknown(self) -> None:
-        depth = changed(arrays()["depth_mm"], (0, 0, slice(0, 3)), [np.nan, np.inf, 0])
+        depth = changed(arrays()["depth_mm"], (0, 0, slice(0, 4)), [np.nan, np.inf, 0, 1e10])
         found = extrags.sequence_from_arrays(**{**arrays(), "depth_mm": depth}).depth_mm
         assert found is not None
-        np.testing.assert_array_equal(found[0, 0, :3], 0)
+        np.testing.assert_array_equal(found[0, 0, :4], 0)
         assert (found[1:] > 0).all()
 
     def test_depth_in_integers(self) -> None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from extrags.cameras import Cameras
 from extrags.events import Event, Progress, subscribed
-from extrags.observed_surface import observed_from_depth
+from extrags.observed_surface import never_observed, observed_from_depth
+from extrags.sequence import EndoscopicSequence, Split
 
 
 def test_it_tells_how_far_it_is() -> None:
@@ -20,3 +23,29 @@ def test_it_tells_how_far_it_is() -> None:
     assert told == [Progress("ingest", done, 3) for done in (1, 2, 3)]
     assert seen[3].any()
     assert not seen[:3].any()
+
+
+def test_never_observed_is_told_of_held_out_pixels_with_depth_alone() -> None:
+    shape = (3, 12, 16)
+    depth, observed, mask = np.full(shape, 10, np.float32), np.zeros(shape, bool), np.ones(shape, bool)
+    depth[:, :3] = 0
+    observed[:, 3:6] = True
+    mask[:, :, :4] = False
+    sequence = EndoscopicSequence(
+        name="made/up",
+        rgb=np.zeros((*shape, 3), np.uint8),
+        K=np.tile(np.eye(3), (3, 1, 1)),
+        mask=mask,
+        split=Split("here", np.array([0]), np.array([1, 2])),
+        depth_mm=depth,
+        observed=observed,
+    )
+    expected = np.zeros(shape, bool)
+    expected[1:, 6:, 4:] = True
+    np.testing.assert_array_equal(never_observed(sequence, np.arange(3)), expected)
+    np.testing.assert_array_equal(never_observed(sequence, 2), expected[2])
+    # Without any depth, what the source says is all there is.
+    bare = replace(sequence, depth_mm=None)
+    expected[1:, :3, 4:] = True
+    np.testing.assert_array_equal(never_observed(bare, np.arange(3)), expected)
+    assert not never_observed(replace(bare, observed=None), np.arange(3)).any()

@@ -329,7 +329,11 @@ class RestorerBenchmark:
         }
         if self.truth.observed is not None:
             seen = torch.from_numpy(np.ascontiguousarray(self.truth.observed))
-            regions |= {"observed": mask & seen, "unobserved": mask & ~seen}
+            unseen = mask & ~seen
+            if self.truth.depth_mm is not None:
+                # Of pixels without depth nothing tells.
+                unseen &= torch.from_numpy(self.truth.depth_mm > 0)
+            regions |= {"observed": mask & seen, "unobserved": unseen}
         return regions
 
     @cached_property

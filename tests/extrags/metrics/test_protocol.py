@@ -132,6 +132,25 @@ def test_masked_out_pixels_do_not_count(sequence: EndoscopicSequence) -> None:
     assert result.metrics["whole"]["psnr"] < 25
 
 
+def test_what_has_no_true_depth_is_in_neither_part(sequence: EndoscopicSequence) -> None:
+    assert sequence.depth_mm is not None
+    assert sequence.observed is not None
+    depth, observed = sequence.depth_mm.copy(), sequence.observed.copy()
+    depth[1, :24] = 0
+    observed[1, :24] = False
+    depth[3], observed[3] = 0, False
+    result = evaluate_views(
+        renders_of(sequence, TEST), replace(sequence, depth_mm=depth, observed=observed), TEST, None
+    )
+    first, second = result.per_view
+    assert first["observed"]["pixel_share"] == pytest.approx(0.5 * 32 / 56)
+    assert first["unobserved"]["pixel_share"] == pytest.approx(0.5 * 24 / 56)
+    # Of a frame without depth nothing is known, not even the share.
+    for part in ("observed", "unobserved"):
+        assert second[part]["psnr"] is None
+        assert second[part]["pixel_share"] is None
+
+
 def test_observed_and_unobserved_stand_apart(sequence: EndoscopicSequence) -> None:
     renders = renders_of(sequence, TEST)
     renders.rgb[0, :, 40:] *= 0.5

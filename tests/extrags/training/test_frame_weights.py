@@ -202,6 +202,14 @@ class TestWithout:
         assert second is not None
         np.testing.assert_array_equal(first.sharpness, second.sharpness)
 
+    def test_a_background_beyond_float32_lies_nowhere(self, plane: EndoscopicSequence) -> None:
+        assert plane.depth_mm is not None
+        depth = plane.depth_mm.copy()
+        depth[2, :3, :3] = np.finfo(np.float32).max
+        found = judged(replace(plane, depth_mm=depth))
+        assert np.isfinite(found.sharpness).all()
+        np.testing.assert_array_equal(found.weights, 1)
+
     def test_depth_frames_cannot_be_compared(self, plane: EndoscopicSequence) -> None:
         with pytest.raises(CaptureError, match="made/plane"):
             ComparedFrames(replace(plane, depth_mm=None), plane.train)

@@ -123,6 +123,24 @@ class TestStartingGaussians:
             with pytest.raises(CaptureError, match="neither depth nor sparse points are known, and all"):
                 refused(bare, bare.train)
 
+    @pytest.mark.parametrize("background", [1e7, 1e10, float(np.finfo(np.float32).max)])
+    def test_a_background_starts_nothing(
+        self, tube_sequence: EndoscopicSequence, background: float, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        """One pixel of it used to stretch the voxels until a few points were left."""
+        assert tube_sequence.depth_mm is not None
+        depth = tube_sequence.depth_mm.copy()
+        row, column = np.argwhere(depth[tube_sequence.train[0]] > 0)[0]
+        depth[tube_sequence.train[0], row, column] = background
+        spoilt = replace(tube_sequence, depth_mm=depth)
+        # As many as there are pixels: each is drawn.
+        many = int(np.count_nonzero(tube_sequence.mask[tube_sequence.train]) // 10)
+        usual = starting_gaussians(tube_sequence, tube_sequence.train, many)
+        found = starting_gaussians(spoilt, spoilt.train, many)
+        assert len(found) == pytest.approx(len(usual), rel=0.02)
+        assert float(found.means.abs().max()) < 1e3
+        assert "start no Gaussian" in caplog.text
+
     def test_sparse_points_give_rough_depth(self, tube_sequence: EndoscopicSequence) -> None:
         generator = np.random.default_rng(0)
         angle, along = generator.uniform(0, 2 * np.pi, 400), generator.uniform(8, 45, 400)
