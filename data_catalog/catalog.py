@@ -26,6 +26,7 @@ from extrags.arguments import check_settings_argument
 from extrags.config import IngestConfig
 from extrags.errors import ConfigError, SourceNotFoundError, UnknownSequenceError
 from extrags.redaction import without_credentials
+from extrags.scarce_depth import without_scarce_depth
 from extrags.sequence import EndoscopicSequence
 
 __all__ = [
@@ -146,8 +147,11 @@ def read(source: Source | str | Path, config: IngestConfig | None = None) -> End
     if config.scale_mm_per_unit is not None:
         sequence = _scaled(sequence, config.scale_mm_per_unit)
     # After the checks, which hold poses against all depth there is; what was observed is known by now.
-    shown = sequence.without_training_depth() if config.withhold_depth else sequence
-    return with_specular(shown)
+    if config.withhold_depth:
+        sequence = sequence.without_training_depth()
+    elif sequence.world_from_camera is not None:
+        sequence = without_scarce_depth(sequence)
+    return with_specular(sequence)
 
 
 def measured_detail(source: Source | str | Path, config: IngestConfig) -> DetailSize | None:

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Real, UInt8
 from extrags.errors import ShapeError, SourceError
 from extrags.frame_stacks import stacked
 from extrags.known_depth import is_background
+from extrags.scarce_depth import without_scarce_depth
 from extrags.sequence import EndoscopicSequence
 from extrags.sequence_checks import check_arrays, check_pose
 from extrags.splits import Split, every_nth
@@ -89,7 +90,7 @@ def sequence_from_arrays(
         raise SourceError(
             "no pixel of any frame has a depth; pass None where none is known", field="depth_mm"
         )
-    return sequence
+    return sequence if sequence.world_from_camera is None else without_scarce_depth(sequence)
 
 
 def _as_bytes(rgb: np.ndarray, labels: Sequence[str]) -> np.ndarray:

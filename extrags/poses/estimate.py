@@ -25,6 +25,7 @@ from extrags.poses.registration_report import (
 )
 from extrags.poses.rgbd import align_by_depth
 from extrags.poses.scale import DENSE_SHARE, depth_scale, typical_depth
+from extrags.scarce_depth import without_scarce_depth
 from extrags.sequence import EndoscopicSequence, ScaleSource, Split
 from extrags.sparse_depth import MIN_POINTS_PER_VIEW, interpolated_depth, pixel_lattice
 
@@ -453,7 +454,10 @@ def with_estimated_poses(
         pose_source="estimated" if estimate.method == "colmap" else "aligned",
         truth={**sequence.truth, "world": "estimated"} if sequence.truth else {},
     )
-    return posed if estimate.calibration is None else with_calibration(posed, estimate.calibration, ingest)
+    if estimate.calibration is not None:
+        posed = with_calibration(posed, estimate.calibration, ingest)
+    # Before, the depth of a few frames told the scale of the poses.
+    return without_scarce_depth(posed)
 
 
 def _run(job: PoseJob, name: str) -> PoseJobResult:
