@@ -42,7 +42,8 @@ def normal_loss(
 class NormalTerm:
     """`normal_loss` against the normals of the nearest starting points, as a term of the training loss.
 
-    Nearest points are looked up where the set of Gaussians has changed, and every `NEAREST_EVERY` iterations.
+    Nearest points are looked up where the set of Gaussians has changed, every `NEAREST_EVERY` iterations, and
+    after each round of densification, which may move Gaussians elsewhere without changing their number.
 
     Args:
         points: starting points in world units.
@@ -50,6 +51,7 @@ class NormalTerm:
         weight: of the term in the loss.
         start: first iteration at which it is active.
         every: iterations from one use to the next.
+        round_every: iterations between rounds of densification.
     """
 
     def __init__(
@@ -60,10 +62,12 @@ class NormalTerm:
         weight: float,
         start: float,
         every: int,
+        round_every: int = NEAREST_EVERY,
     ) -> None:
         self._points = cKDTree(points)
         self._normals = torch.from_numpy(normals)
         self._weight, self._start, self._every = weight, start, every
+        self._round_every = round_every
         self._assigned: tuple[Tensor, int, Tensor] | None = None
         """Positions and iteration of the last look-up, and the normals found."""
 
@@ -82,6 +86,7 @@ class NormalTerm:
             weight=config.normal_weight,
             start=config.normal_start_share * iterations,
             every=config.normal_every,
+            round_every=config.densify.every,
         )
 
     def penalty(self, parameters: dict[str, Tensor], iteration: int) -> Tensor | None:
@@ -99,10 +104,15 @@ class NormalTerm:
 
     def _normals_for(self, means: Tensor, iteration: int) -> Tensor:
         known = self._assigned
-        if known is not None and known[0] is means and 0 <= iteration - known[1] < NEAREST_EVERY:
+        if known is not None and known[0] is means and self._same_stretch(known[1], iteration):
             return known[2]
         # The tree is on the processor: positions come there whenever nearest points are looked up again.
         _, nearest = self._points.query(means.detach().cpu().numpy())
         normals = self._normals[torch.from_numpy(nearest)].to(means)
         self._assigned = means, iteration, normals
         return normals
+
+    def _same_stretch(self, earlier: int, iteration: int) -> bool:
+        """Whether nothing but steps of the optimiser lies between two iterations, and not many."""
+        same_round = earlier // self._round_every == iteration // self._round_every
+        return same_round and 0 <= iteration - earlier < NEAREST_EVERY

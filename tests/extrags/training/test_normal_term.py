@@ -125,6 +125,13 @@ class TestNormalTerm:
         found = self.term(weight=0.2).penalty(self.parameters(9), 0)
         assert float(found) == pytest.approx(0.2)  # type: ignore[arg-type]
 
+    def test_a_round_of_densification_may_have_moved_rows(self) -> None:
+        term, parameters = self.term(round_every=30), self.parameters(0)
+        assert float(term.penalty(parameters, 29)) == 0  # type: ignore[arg-type]
+        # In place, as a relocation does: the tensor is the same.
+        parameters["means"][0, 0] = 9
+        assert float(term.penalty(parameters, 30)) == 1  # type: ignore[arg-type]
+
     def test_moved_and_new_gaussians_find_another_point(self) -> None:
         term, parameters = self.term(), self.parameters(0)
         assert float(term.penalty(parameters, 0)) == 0  # type: ignore[arg-type]
