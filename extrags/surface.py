@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +28,8 @@ __all__ = ["Mesh", "fuse_depth", "fuse_surface", "rendered_depth"]
 
 _log = logging.getLogger(__name__)
 
+LARGEST_DEPTH = 1000.0
+"""Beyond this depth is fused in a larger unit."""
 VIEWS_PER_BATCH = 8
 """Views rendered in one call; limits the memory, does not affect the result."""
 
@@ -165,6 +168,7 @@ def fuse_depth(cameras: Cameras, depth_mm: Float[np.ndarray, "c h w"], config: S
         raise CaptureError(
             f"none of the {len(cameras)} views sees a surface; the reconstruction is empty there"
         )
+    unit = _fusing_unit(typical_far_mm)
     voxel_mm = typical_far_mm * config.voxel_share
     if not any(bool((depths < far_mm).any()) for depths in valid()):
         # A wall that faces the camera has one depth, which is to be fused and not cut off.
@@ -177,7 +181,7 @@ def fuse_depth(cameras: Cameras, depth_mm: Float[np.ndarray, "c h w"], config: S
         attr_names=("tsdf", "weight"),
         attr_dtypes=(o3c.float32, o3c.float32),
         attr_channels=(o3c.SizeVector([1]), o3c.SizeVector([1])),
-        voxel_size=voxel_mm,
+        voxel_size=voxel_mm / unit,
         block_resolution=8,
         block_count=20_000,
         device=o3c.Device("CPU:0"),
@@ -186,13 +190,15 @@ def fuse_depth(cameras: Cameras, depth_mm: Float[np.ndarray, "c h w"], config: S
     # It rejects arrays with an explicit byte order, which zarr returns; astype yields the native one.
     K = cameras.K.astype(np.float64)
     viewmats = cameras.viewmats.astype(np.float64)
+    viewmats[:, :3, 3] /= unit
     for index in range(len(cameras)):
         # A view without depth below the limit activates no block, which Open3D reports as an error.
         if not ((depth_mm[index] > 0) & (depth_mm[index] < far_mm)).any():
             continue
-        image = o3d.t.geometry.Image(o3c.Tensor(depth_mm[index].astype(np.float32, order="C")))
+        depth = (depth_mm[index] / np.float32(unit)).astype(np.float32, order="C")
+        image = o3d.t.geometry.Image(o3c.Tensor(depth))
         intrinsic, extrinsic = o3c.Tensor(K[index]), o3c.Tensor(viewmats[index])
-        view = (image, intrinsic, extrinsic, 1.0, far_mm, config.truncation_voxels)
+        view = (image, intrinsic, extrinsic, 1.0, far_mm / unit, config.truncation_voxels)
         try:
             blocks = grid.compute_unique_block_coordinates(*view)
         except RuntimeError as error:
@@ -207,11 +213,17 @@ def fuse_depth(cameras: Cameras, depth_mm: Float[np.ndarray, "c h w"], config: S
     if len(extracted.vertex.positions) == 0 or len(extracted.triangle.indices) == 0:
         raise CaptureError(f"the fused depth of {len(cameras)} views holds no surface")
     vertices, triangles = _canonical(
-        extracted.vertex.positions.numpy(), extracted.triangle.indices.numpy().astype(np.int64)
+        extracted.vertex.positions.numpy() * np.float32(unit),
+        extracted.triangle.indices.numpy().astype(np.int64),
     )
     mesh = _without_small_clusters(vertices, triangles, config.min_cluster_triangles)
     _log.info("surface: %d vertices, %d triangles", len(mesh.vertices), len(mesh.triangles))
     return mesh
+
+
+def _fusing_unit(typical_far_mm: float) -> float:
+    """A power of two, so that no digit is lost: Open3D loses surface where depths are large numbers."""
+    return float(2.0 ** max(0, math.floor(math.log2(typical_far_mm / LARGEST_DEPTH))))
 
 
 def _canonical(

@@ -9,7 +9,7 @@ from tasks.stage import stage
 __all__ = ["surface"]
 
 
-@stage("surface", version=2)
+@stage("surface", version=3)
 def surface(slot: Slot, scene: Ref, sequence: Ref, config: SurfaceConfig) -> None:
     """Fuse the training views' rendered depth; writes `mesh/` and `mesh.ply`."""
     from extrags.scene import Scene

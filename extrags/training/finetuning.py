@@ -61,6 +61,8 @@ MIN_GAIN = 0.05
 
 HOLE_STRIDE_PX = 2
 """Hole pixels are taken on a grid of this step; thinning would drop most of them anyway."""
+LEAST_SPACING_PX = 2.0
+"""New Gaussians lie no closer, at the median depth of the holes, than the grid that they are taken from."""
 
 
 def finetune(
@@ -301,7 +303,9 @@ def hole_gaussians(
     points, rgb = points[placed], rgb[placed]
     if len(points) < MIN_POINTS:
         return None
-    spacing = _typical_spacing(scene.gaussians)
+    # Where Gaussians lie upon each other, as after a relocation, their spacing says nothing of the surface's.
+    shown_px_mm = np.median(pseudo_views.depth_mm.reshape(-1)[chosen] / cameras.K[view, 0, 0])
+    spacing = max(_typical_spacing(scene.gaussians), LEAST_SPACING_PX * float(shown_px_mm))
     points, rgb = _one_per_cell(points, rgb, spacing)
     points, rgb = thin_out(points, rgb, room)
     radius = np.full(len(points), 0.7 * spacing)

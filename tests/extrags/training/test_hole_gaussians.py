@@ -57,6 +57,12 @@ def projected(points: np.ndarray, camera: Any, index: int) -> tuple[np.ndarray, 
     return pixels, z
 
 
+@pytest.fixture(autouse=True)
+def every_point_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """None is merged with its neighbours (`wall_scene`)."""
+    monkeypatch.setattr(finetuning, "LEAST_SPACING_PX", 0.0)
+
+
 @pytest.fixture
 def real_views_carve_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without the rules on virtual views and on cameras, which have tests of their own."""
@@ -314,3 +320,21 @@ class TestHoleGaussians:
     def test_nothing_to_fill(self, sequence: EndoscopicSequence, pseudo: PseudoViews) -> None:
         none = wall_views(pseudo, np.full((3, HEIGHT, WIDTH), 20.0), np.zeros((3, HEIGHT, WIDTH), dtype=bool))
         assert hole_gaussians(wall_scene(None), sequence, none, self.ROOM) is None
+
+    @pytest.mark.usefixtures("real_views_carve_alone")
+    def test_gaussians_that_lie_upon_each_other_do_not_make_new_ones_small(
+        self,
+        sequence: EndoscopicSequence,
+        pseudo: PseudoViews,
+        holes: np.ndarray,
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> None:
+        """As after a relocation: the nearest neighbour is a copy, at no distance."""
+        monkeypatch.setattr(finetuning, "LEAST_SPACING_PX", 2.0)
+        depth_mm = 10.0
+        views = wall_views(pseudo, np.full((3, HEIGHT, WIDTH), depth_mm), holes)
+        new = hole_gaussians(wall_scene(None), sequence, views, 10_000)
+        assert new is not None
+        footprint_mm = depth_mm / pseudo.cameras.K[0, 0, 0]
+        radius = new.scales.exp().max(dim=1).values
+        torch.testing.assert_close(radius, torch.full_like(radius, 1.4 * footprint_mm), rtol=1e-4, atol=0)
