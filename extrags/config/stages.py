@@ -275,7 +275,10 @@ class ReportConfig(StageConfig):
 
 
 class PipelineConfig(StageConfig):
-    """All stages of one run."""
+    """All stages of one run.
+
+    The defaults of its fields are no profile: what is run without settings is `PROFILES["balanced"]`.
+    """
 
     not_in_keys: ClassVar[frozenset[str]] = frozenset({"device"})
     """Stages count the device they ran on: `auto` would be another on another machine."""
