@@ -260,7 +260,7 @@ class EvaluateConfig(StageConfig):
     @classmethod
     def _once_each(cls, nets: tuple[LpipsNet, ...]) -> tuple[LpipsNet, ...]:
         if len(set(nets)) < len(nets):
-            raise ValueError("a backbone is there twice")
+            raise ValueError("a backbone is given twice")
         return nets
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from extrags.errors import ConfigError
 from flows.commands.common import items, set_up_logging, store_root, write_json
-from flows.commands.options import Parser, add_json, add_profile, add_settings, add_store
+from flows.commands.options import Parser, add_json, add_profile, add_sequences, add_settings, add_store
 
 __all__ = ["add_arguments", "explore"]
 
@@ -28,7 +28,7 @@ def add_arguments(parser: Parser) -> None:
         "badly, and of the never-observed pixels of held-out frames. For sequences with a true surface: "
         "phantoms, and recordings with true depth. `clairvoyant` and `oracle` know the true surface."
     )
-    parser.add_argument("sequences", nargs="+", metavar="SEQUENCE")
+    add_sequences(parser, chosen=False)
     parser.add_argument(
         "--ways",
         nargs="+",
