@@ -1,4 +1,4 @@
-"""`benchmark`: methods compared over sequences, profiles and seeds (its JSON: docs/command_line.md)."""
+"""`benchmark`: methods compared over sequences, profiles and seeds (its JSON: docs/json.md)."""
 
 from __future__ import annotations
 

@@ -145,7 +145,7 @@ class SequenceOutcome:
         return next((row for row in self.stages if row.stage == stage), None)
 
     def to_json(self) -> dict[str, Any]:
-        """A JSON object; keys as in docs/command_line.md."""
+        """A JSON object; keys as in docs/json.md."""
         return {
             "name": self.name,
             "variant": self.variant,
@@ -176,7 +176,7 @@ class DatasetOutcome:
         return failed / len(self.sequences) if self.sequences else 0.0
 
     def to_json(self, seconds: float) -> dict[str, Any]:
-        """A JSON object; keys as in docs/command_line.md."""
+        """A JSON object; keys as in docs/json.md."""
         return {
             "seconds": round(seconds, 3),
             "sequences": [outcome.to_json() for outcome in self.sequences],

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from flows.cli import main
+from tests.documented_json import undocumented
 from tests.flows.tiny import SEQUENCE, TINY
 
 pytestmark = pytest.mark.usefixtures("untouched_environment")
@@ -31,13 +32,13 @@ def run(store: Path, *arguments: str) -> dict[str, Any]:
     given = ["bench", "explore", SEQUENCE, "--store", str(store / "store"), *SETTINGS]
     assert main([*given, *arguments, "--json", str(target)]) == 0
     found: dict[str, Any] = json.loads(target.read_text())
+    assert not undocumented(found, "bench-explore")
     return found
 
 
 def test_a_table_and_json(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
     ways = ["extrags", "random", "perturbed", "frontier", "clairvoyant"]
     found = run(store, "--views", "2", "4", "--ways", *ways)
-    assert {"processor", "cores", "versions", "commit"} <= set(found["machine"])
     assert [case["way"] for case in found["cases"]] == ways
     assert found["views"] == [2, 4]
     assert found["config"]["explore"]["length"] == TINY["explore.length"]
