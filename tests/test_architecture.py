@@ -37,7 +37,7 @@ def test_importing_the_library_loads_nothing_heavy() -> None:
 
 
 def test_packages_say_that_they_are_typed() -> None:
-    """The wheel holds their folders as they are tracked; type checkers pass over packages without the mark."""
+    """The wheel holds their folders as they are tracked; checkers pass over those without the mark."""
     tracked = subprocess.run(
         ["git", "ls-files"], cwd=REPOSITORY, capture_output=True, text=True, check=True
     ).stdout.split("\n")

@@ -26,7 +26,7 @@ def add_arguments(parser: Parser) -> None:
         "Reconstruct each sequence once per seed, choose virtual views in each way, and measure what they "
         "show of the true surface: of what training never saw (seen at all, and seen well), of what it saw "
         "badly, and of the never-observed pixels of held-out frames. For sequences with a true surface: "
-        "phantoms, and recordings with true depth. `clairvoyant` and `oracle` know the true surface."
+        "phantoms, and recordings with true depth. `clairvoyant` and `free-viewpoint` know the true surface."
     )
     add_sequences(parser, chosen=False)
     parser.add_argument(
@@ -35,7 +35,7 @@ def add_arguments(parser: Parser) -> None:
         default=[],
         metavar="WAY",
         help="extrags, paper, paper-no-illumination, paper-no-fold, exploregs, frontier, random, perturbed, "
-        "clairvoyant, oracle (default: all)",
+        "clairvoyant, free-viewpoint (default: all)",
     )
     parser.add_argument(
         "--views",

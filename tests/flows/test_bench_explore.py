@@ -75,6 +75,8 @@ def test_end_use_restores_and_fine_tunes(store: Path, capsys: pytest.CaptureFixt
     ("arguments", "message"),
     [
         ([SEQUENCE, "--ways", "straight"], "unknown ways straight; expected extrags, paper"),
+        # The method that trains on held-out frames is no way to choose views.
+        ([SEQUENCE, "--ways", "oracle"], "unknown ways oracle; expected extrags, paper"),
         ([SEQUENCE, "--views", "0"], "numbers of views [0]; expected 1 or more"),
         ([SEQUENCE, "--views", "many"], "--views many: expected a whole number"),
     ],
