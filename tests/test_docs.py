@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 from pydantic import BaseModel
 
+from data_catalog.catalog import describe
 from extrags.config import PipelineConfig
 from tests.documented_json import tables, undocumented
 
@@ -131,6 +132,30 @@ def test_documented_json_names_tables_that_are_there() -> None:
 
 def linked(kind: str) -> list[str]:
     return re.findall(r"\(#(.*?)\)", kind)
+
+
+def test_licences_name_whatever_is_bundled() -> None:
+    """Every file of weights, and the pictures of each sequence."""
+    text = (REPOSITORY / "docs/licences.md").read_text()
+    files = [*(REPOSITORY / "extrags").rglob("*.safetensors"), REPOSITORY / ".github/overview.jpg"]
+    assert len(files) == 5
+    wanted = {file.relative_to(REPOSITORY).as_posix() for file in files}
+    for folder in {file.parent for file in (REPOSITORY / "docs").rglob("*.jpg")}:
+        here = folder.relative_to(REPOSITORY).as_posix()
+        pictures = folder.glob("*.jpg")
+        wanted |= (
+            {f"{here}/{re.sub('(view|virtual)_[0-9]+.jpg$', '*.jpg', file.name)}" for file in pictures}
+            if folder.name == "gallery"
+            else {f"{here}/*"}
+        )
+    assert {name for name in wanted if f"`{name}`" not in text} == set()
+
+
+def test_the_gallery_says_whose_its_pictures_are() -> None:
+    sections = (REPOSITORY / "docs/gallery/index.md").read_text().split("\n## ")[1:]
+    for section in sections:
+        known = describe(section.partition("\n")[0])
+        assert f"Pictures derive from: {known.description}. Licence: {known.licence}.\n" in section
 
 
 def test_every_kind_of_artefact_is_in_the_index() -> None:
