@@ -2,8 +2,8 @@
 
 * `clairvoyant_clips`: the same starts, moves and free space as the search, but each clip chosen by what it
   truly shows of surface that training never saw or saw badly.
-* `oracle_poses`: single poses anywhere in free space near the recording, of any direction, chosen greedily
-  from a large pool: what neither starts nor moves limit.
+* `free_viewpoint_poses`: single poses anywhere in free space near the recording, of any direction, chosen
+  greedily from a large pool: what neither starts nor moves limit.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from extrags.events import Progress, emit
 from extrags.exploration.ways import Clip, Moves, greedy_clips
 from extrags.freespace import FREE
 
-__all__ = ["LackingSurface", "clairvoyant_clips", "oracle_poses"]
+__all__ = ["LackingSurface", "clairvoyant_clips", "free_viewpoint_poses"]
 
 BEAM = 6
 MAX_PLANNING_SAMPLES = 8_000
@@ -116,7 +116,7 @@ def clairvoyant_clips(
     return greedy_clips(moves, cameras, n_views, lacking, beam=beam)
 
 
-def oracle_poses(
+def free_viewpoint_poses(
     truth: SurfaceTruth, moves: Moves, cameras: Cameras, n_views: int, seed: int, *, pool: int = POOL
 ) -> list[Clip]:
     """Single poses of a pool, chosen by what they truly show; each is a clip of one view.

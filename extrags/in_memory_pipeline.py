@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from extrags.config import PipelineConfig
+from extrags.config import PROFILES, PipelineConfig
 from extrags.errors import CaptureError, ConfigError
 from extrags.pipeline import Pipeline, StageName
 
@@ -453,7 +453,8 @@ def run_pipeline(
 
     Args:
         sequence: the frames, from `extrags.read` or `extrags.sequence_from_arrays`.
-        config: settings of all stages, e.g. `extrags.PROFILES["quick"]`; None takes the defaults.
+        config: settings of all stages, e.g. `extrags.PROFILES["quick"]`; None takes the profile
+            `balanced`, as `extrags run` does.
         until: last stage to run.
         leave_out: stages to skip regardless of the plan, with the reason.
         true_surface: ground truth of the surface (`data_catalog.true_surface`); None omits its metrics.
@@ -472,7 +473,7 @@ def run_pipeline(
     from extrags.arguments import check_sequence_argument, check_settings_argument
 
     check_sequence_argument(sequence, "run_pipeline")
-    config = PipelineConfig() if config is None else config
+    config = PROFILES["balanced"] if config is None else config
     check_settings_argument(config, PipelineConfig, "run_pipeline", 'extrags.PROFILES["quick"]')
     pipeline = InMemoryPipeline(sequence, config, leave_out, true_surface=true_surface)
     pipeline.run_stages(until)

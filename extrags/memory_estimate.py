@@ -59,13 +59,12 @@ METRICS = 3500
 ENLARGED = 100
 """Bytes per pixel of a held-out view that is mixed with its restored one at the full size."""
 CLIP_VIEWS = 8
-"""Held-out views that are restored at once."""
+"""Held-out views that are restored at once (`extrags.restoration.benchmark.evaluation`, which loads more)."""
 RENDERED_VIEW = 24
 """Bytes per pixel of a rendered held-out view: what is computed of many at once is not mapped."""
 FUSED_STACKS = (4, 4, 4, 4)
 """Bytes per pixel of the stacks of rendered training views: depth, and what is made of it to be fused."""
 PIXELS_MEASURED_AT_ONCE = 400_000
-SURFACE_WIDTH = 320
 SMALLEST_WIDTH = 32
 STEPS = {"enhance.max_width": 16, "enhance.max_views": 8, "ingest.width": 16}
 """What settings are multiples of when they are named: an estimate is no finer."""
@@ -157,7 +156,7 @@ def estimate_memory(
     batch_views = min(views, config.enhance.clips_per_batch * (config.explore.length + 1))
     network = NETWORK * threads * working if config.enhance.backend == "embedded" else 0
     references = REFERENCE * train * working
-    small = round(pixels * min(1.0, SURFACE_WIDTH / size.width) ** 2)
+    fused = round(pixels * min(1.0, config.surface.max_width / size.width) ** 2)
     matched = round(pixels * min(1.0, config.depth.max_width / size.width) ** 2)
     looked_at = round(pixels * min(1.0, config.poses.max_width / size.width) ** 2)
     features = FEATURES * threads * looked_at
@@ -175,8 +174,9 @@ def estimate_memory(
         "poses": whole + features,
         "depth": held + _held(DEPTH_STACKS, train * pixels) + max(features, DEPTH_FRAME * train * matched),
         "coarse": held + steps + gaussian * coarse_gaussians,
-        "surface": held + _held(FUSED_STACKS, train * small),
-        "explore": held + _held(FUSED_STACKS, train * small),
+        "surface": held + _held(FUSED_STACKS, train * fused),
+        # It keeps what the surface took before it in the same process, and renders smaller views itself.
+        "explore": held + _held(FUSED_STACKS, train * fused),
         "enhance": held
         + max(
             # The judge of the restorer runs the network beside the pairs.

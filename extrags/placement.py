@@ -99,7 +99,7 @@ def placements(config: PipelineConfig) -> list[Placement]:
         config: settings of all stages.
 
     Raises:
-        ConfigError: as `check_device`, and where a stage's own device cannot be had.
+        ConfigError: as `check_device`, and where a stage's own device is unavailable.
         MissingDependencyError: as `check_device`.
     """
     check_device(config)

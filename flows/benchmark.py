@@ -1,4 +1,4 @@
-"""`benchmark`: methods compared over sequences, profiles and seeds (its JSON: docs/command_line.md)."""
+"""`benchmark`: methods compared over sequences, profiles and seeds (its JSON: docs/json.md)."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from flows.history import (
 from flows.leases import run_lease
 from flows.limits import DEFAULT_LIMITS, StageLimits
 from flows.methods import METHODS, MethodName, method_config
-from flows.outcome import SequenceOutcome
+from flows.outcome import NOT_COUNTED, SequenceOutcome
 from flows.pages import benchmark_page
 from flows.parameters import Sequences, Settings, StoreRoot, Variants
 from flows.preflight import preflight
@@ -48,8 +48,6 @@ __all__ = ["Case", "benchmark", "case_of", "check_methods", "run_method"]
 
 log = logging.getLogger(__name__)
 
-NOT_COUNTED = frozenset({"evaluate", "report"})
-"""Stages that are not part of a method's run time."""
 PREFERRED_BASELINE = "3dgs"
 
 

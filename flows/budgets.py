@@ -11,7 +11,7 @@ from extrags.config import PipelineConfig
 from extrags.config.settings import settings_of, unknown_setting
 from extrags.errors import ConfigError
 
-__all__ = ["PRESETS", "Budget", "budgets_of", "parsed_vary", "preset_budgets", "reaching"]
+__all__ = ["PRESETS", "SET_PRESETS", "Budget", "budgets_of", "parsed_vary", "preset_budgets", "reaching"]
 
 AS_PROFILE = "profile"
 """Name of the budget that changes nothing."""

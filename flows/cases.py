@@ -139,7 +139,7 @@ def cases_of(
     must have an effect on all of them.
 
     Raises:
-        ConfigError: for a method or seed that is there twice; for wrong settings, once for all sequences that
+        ConfigError: for a method or seed that is given twice; for wrong settings, once for all sequences that
             have the same.
     """
     for what, values in (("method", methods), ("seed", seeds)):

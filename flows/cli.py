@@ -33,9 +33,9 @@ VERBS = {
     "view": "look at a scene in the browser, live: light, layers, camera paths to record",
     "export": "write a reconstructed scene as Gaussians, mesh or video, or a sequence for COLMAP",
     "import": "take a scene that another program has made through the later stages",
-    "data": "what sequences there are, and whether a source is right",
+    "data": "list, inspect and validate input sequences",
     "cache": "what is in the store",
-    "reconcile": "set runs that a power loss left Running to Crashed",
+    "reconcile": "mark runs left Running by a power loss as Crashed",
     "devices": "what a run would do on the processor and what on a GPU, and why",
     "weights": "which weights of networks are on this machine, and their download",
     "evaluate": "measure renders made elsewhere, or show the figures of a finished run",
@@ -63,9 +63,9 @@ EXAMPLES = """examples:
   extrags compare phantom/0@sparse --methods 3dgs extrags
   extrags data check my_video.mp4 my_colmap_scene/
   extrags view phantom/0@sparse --scene coarse
-  extrags export phantom/0@sparse --to spz --out scene.spz
+  extrags export phantom/0@sparse --to spz --output scene.spz
   extrags import theirs.ply --sequence their_colmap_folder/ --profile quick
-  extrags export phantom/0@sparse --to colmap --out scene/
+  extrags export phantom/0@sparse --to colmap --output scene/
   extrags cache rm 'explore*'
 
 A sequence is DATASET/SEQUENCE[@SETTING] (see `extrags data list`) or the path of a folder or a video.

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from data_catalog.clairvoyant import clairvoyant_clips, oracle_poses
+from data_catalog.clairvoyant import clairvoyant_clips, free_viewpoint_poses
 from data_catalog.surface_views import SurfaceCoverage, SurfaceTruth
 from extrags.cameras import Cameras
 from extrags.config import ExploreConfig, PipelineConfig
@@ -151,7 +151,9 @@ WAYS: dict[str, Way] = {
     "clairvoyant": Way(
         "same starts and moves, chosen by what the true surface shows", _by_truth(clairvoyant_clips)
     ),
-    "oracle": Way("single poses anywhere in free space, chosen by the true surface", _by_truth(oracle_poses)),
+    "free-viewpoint": Way(
+        "single poses anywhere in free space, chosen by the true surface", _by_truth(free_viewpoint_poses)
+    ),
 }
 """By name, in the order of the table. The last two know the true surface: upper references, no methods."""
 

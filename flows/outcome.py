@@ -9,6 +9,7 @@ from extrags.errors import ExtragsError
 from extrags.store import Ref
 
 __all__ = [
+    "NOT_COUNTED",
     "DatasetFailedError",
     "DatasetOutcome",
     "Part",
@@ -47,6 +48,9 @@ Part = Literal[
 training frames, `training` the training frames alone, with that depth where it was estimated,
 `waves` the state of the exploration, `restorer` the restorer prepared for this scene, `judgement` how much of
 the fine-tuning is kept; what is `restored` are the final scene's held-out views, restored in the image."""
+
+NOT_COUNTED = frozenset({"evaluate", "report"})
+"""Stages that are not part of a method's run time."""
 
 StageState = Literal["ran", "cached", "skipped", "failed", "interrupted"]
 """How a stage ended. An interrupted one is announced, never returned: the run ends with it."""
@@ -145,7 +149,7 @@ class SequenceOutcome:
         return next((row for row in self.stages if row.stage == stage), None)
 
     def to_json(self) -> dict[str, Any]:
-        """A JSON object; keys as in docs/command_line.md."""
+        """A JSON object; keys as in docs/json.md."""
         return {
             "name": self.name,
             "variant": self.variant,
@@ -176,7 +180,7 @@ class DatasetOutcome:
         return failed / len(self.sequences) if self.sequences else 0.0
 
     def to_json(self, seconds: float) -> dict[str, Any]:
-        """A JSON object; keys as in docs/command_line.md."""
+        """A JSON object; keys as in docs/json.md."""
         return {
             "seconds": round(seconds, 3),
             "sequences": [outcome.to_json() for outcome in self.sequences],

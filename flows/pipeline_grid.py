@@ -24,6 +24,7 @@ from extrags.errors import ConfigError, ExtragsError
 from extrags.store import digest_of
 from flows.budgets import Budget, reaching
 from flows.history import SAME_MACHINE
+from flows.outcome import NOT_COUNTED
 from flows.selection import Chosen
 
 if TYPE_CHECKING:
@@ -34,8 +35,6 @@ __all__ = ["FORMAT", "Cell", "cells_of", "content_of", "in_own_process", "run_ce
 log = logging.getLogger(__name__)
 
 FORMAT = "extrags-pipeline-grid-1"
-NOT_COUNTED = frozenset({"evaluate", "report"})
-"""Stages that are not part of a method's run time."""
 
 
 @dataclass(frozen=True)

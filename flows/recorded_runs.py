@@ -12,7 +12,7 @@ from urllib.parse import quote
 
 from data_catalog.names import comparable_name
 from data_catalog.patterns import is_named
-from extrags.errors import ConfigError, StoreError
+from extrags.errors import ConfigError, StoreError, UnknownSequenceError
 from extrags.pipeline import HELD_OUT_TRAINED_ON
 from extrags.report.leaderboard import BoardRow
 from extrags.store import Manifest, Ref, Store
@@ -25,6 +25,7 @@ from flows.outcome_records import (
 )
 
 if TYPE_CHECKING:
+    from data_catalog.dataset import Descriptor
     from extrags.report.gallery import GalleryRun
     from extrags.report.run_comparison import ComparedRun
     from extrags.sequence import EndoscopicSequence
@@ -269,6 +270,7 @@ def gallery_run(store: Store, run: RecordedRun) -> GalleryRun:
     if frames is None or not rgb:
         raise StoreError(f"{run.sequence}: the page {run.report.key} was made without an evaluation")
     traits = run.traits()
+    known = _described(run.sequence)
     return GalleryRun(
         sequence=store.load(EndoscopicSequence, frames),
         rgb=rgb,
@@ -277,7 +279,19 @@ def gallery_run(store: Store, run: RecordedRun) -> GalleryRun:
         profile=traits.get("profile", ""),
         pseudo=None if enhance is None else store.load(PseudoViews, enhance),
         held_out=_knowledge(run),
+        source="" if known is None else known.description,
+        licence="" if known is None else known.licence,
     )
+
+
+def _described(sequence: str) -> Descriptor | None:
+    """What the catalogue knows of a sequence; None of a path."""
+    from data_catalog import catalog
+
+    try:
+        return catalog.describe(sequence)
+    except UnknownSequenceError:
+        return None
 
 
 def _knowledge(run: RecordedRun) -> str:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from extrags.config import DepthConfig, PosesConfig
+from extrags.depth.weights import BUNDLED
 from extrags.errors import WeightsError
 from extrags.store import Ref, Slot
 from tasks.stage import stage
 from tasks.weights import depth_completion_digest, depth_monocular_digest
 
 __all__ = ["depth", "depth_frames", "keyed_settings", "triangulation_settings"]
-
-BUNDLED = "bundled"
 
 TRIANGULATION = frozenset(
     {

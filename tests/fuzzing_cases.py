@@ -274,7 +274,6 @@ def calibration(file: Path) -> object:
 
 
 _MODEL = "sparse/0/"
-_ZARR = f"artefacts/toy-v1-0/{EndoscopicSequence.stored_as}"
 
 CASES: dict[str, Case] = {
     "poses.json": Case(posed("npy"), "poses.json", source),

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
+import extrags
+
 REPOSITORY = Path(__file__).resolve().parents[1]
+PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())
 
 
 def test_imports_run_one_way() -> None:
@@ -30,6 +34,20 @@ def test_importing_the_library_loads_nothing_heavy() -> None:
         [sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True, check=True
     )
     assert result.stdout.strip() == "[]"
+
+
+def test_packages_say_that_they_are_typed() -> None:
+    """The wheel holds their folders as they are tracked; checkers pass over those without the mark."""
+    tracked = subprocess.run(
+        ["git", "ls-files"], cwd=REPOSITORY, capture_output=True, text=True, check=True
+    ).stdout.split("\n")
+    packages = PROJECT["tool"]["scikit-build"]["wheel"]["packages"]
+    assert set(packages) == set(PROJECT["tool"]["mypy"]["packages"])
+    assert {f"{package}/py.typed" for package in packages} <= set(tracked)
+
+
+def test_the_version_is_the_project_s() -> None:
+    assert extrags.__version__ == PROJECT["project"]["version"]
 
 
 def test_root_holds_only_what_belongs_there() -> None:

@@ -15,7 +15,9 @@ from pathlib import Path
 import pytest
 from pydantic import BaseModel
 
+from data_catalog.catalog import describe
 from extrags.config import PipelineConfig
+from tests.documented_json import tables, undocumented
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 PROTOCOL = REPOSITORY / "extrags" / "metrics" / "PROTOCOL.md"
@@ -96,6 +98,64 @@ def test_every_stage_has_a_page() -> None:
     pages = {stage: page for stages, page in rows for stage in stages.split(", ")}
     assert set(STAGES) <= set(pages)
     assert all((REPOSITORY / "docs" / page).is_file() for page in pages.values())
+
+
+def test_json_that_is_not_as_documented_is_found() -> None:
+    """What writes the JSON is held against the tables where it is tested."""
+    shares = {"never_seen": 0.5, "never_seen_well": None, "badly_seen": 0.1, "held_out": 0}
+    assert undocumented(shares, "shares") == []
+    assert undocumented({**shares, "seen": 1.0}, "shares") == ["$.seen is not documented"]
+    assert undocumented({**shares, "held_out": "0"}, "shares") == ["$.held_out is str, not number or null"]
+    del shares["badly_seen"]
+    assert undocumented(shares, "shares") == ["$.badly_seen is not there"]
+    costs = {"stage": "coarse", "processor_seconds": 1.0, "seconds": None}
+    found = undocumented(
+        {
+            "processor_seconds": 1.0,
+            "seconds": None,
+            "peak_mib": 7,
+            "source": "probe",
+            "records": True,
+            "unknown": [],
+            "stages": [costs],
+        },
+        "a-prediction",
+    )
+    assert found == ["$.records is bool, not integer", "$.stages.0.peak_mib is not there"]
+
+
+def test_documented_json_names_tables_that_are_there() -> None:
+    named = {anchor for table in tables().values() for kind in table.values() for anchor in linked(kind)}
+    assert len(named) > 30
+    assert named <= set(tables())
+
+
+def linked(kind: str) -> list[str]:
+    return re.findall(r"\(#(.*?)\)", kind)
+
+
+def test_licences_name_whatever_is_bundled() -> None:
+    """Every file of weights, and the pictures of each sequence."""
+    text = (REPOSITORY / "docs/licences.md").read_text()
+    files = [*(REPOSITORY / "extrags").rglob("*.safetensors"), REPOSITORY / ".github/overview.jpg"]
+    assert len(files) == 5
+    wanted = {file.relative_to(REPOSITORY).as_posix() for file in files}
+    for folder in {file.parent for file in (REPOSITORY / "docs").rglob("*.jpg")}:
+        here = folder.relative_to(REPOSITORY).as_posix()
+        pictures = folder.glob("*.jpg")
+        wanted |= (
+            {f"{here}/{re.sub('(view|virtual)_[0-9]+.jpg$', '*.jpg', file.name)}" for file in pictures}
+            if folder.name == "gallery"
+            else {f"{here}/*"}
+        )
+    assert {name for name in wanted if f"`{name}`" not in text} == set()
+
+
+def test_the_gallery_says_whose_its_pictures_are() -> None:
+    sections = (REPOSITORY / "docs/gallery/index.md").read_text().split("\n## ")[1:]
+    for section in sections:
+        known = describe(section.partition("\n")[0])
+        assert f"Pictures derive from: {known.description}. Licence: {known.licence}.\n" in section
 
 
 def test_every_kind_of_artefact_is_in_the_index() -> None:

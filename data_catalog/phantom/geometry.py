@@ -79,7 +79,6 @@ class Wall:
         crest: 0 in the pouches, 1 on the crests of the folds, [U, T].
         bump: 1 on the top of polyps, 0 elsewhere, [U, T].
         polyps: the bumps.
-        fold_arcs_mm: where the folds are.
     """
 
     center_line: CenterLine
@@ -92,7 +91,6 @@ class Wall:
     crest: Float[np.ndarray, "u t"]
     bump: Float[np.ndarray, "u t"]
     polyps: tuple[Polyp, ...]
-    fold_arcs_mm: tuple[float, ...]
 
     @property
     def vertices(self) -> Float[np.ndarray, "v 3"]:
@@ -163,9 +161,7 @@ def build_wall(config: PhantomConfig) -> Wall:
     bump, height = _polyp_height(polyps, points, center_line)
     points = points + height[..., None] * normals
     normals, along = _normals(points, center_line.point(arc))
-    return Wall(
-        center_line, radius, u, theta, points, normals, along, crest, bump, tuple(polyps), tuple(folds)
-    )
+    return Wall(center_line, radius, u, theta, points, normals, along, crest, bump, tuple(polyps))
 
 
 def _center_line(rng: np.random.Generator, curving: float) -> CenterLine:

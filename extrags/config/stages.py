@@ -260,7 +260,7 @@ class EvaluateConfig(StageConfig):
     @classmethod
     def _once_each(cls, nets: tuple[LpipsNet, ...]) -> tuple[LpipsNet, ...]:
         if len(set(nets)) < len(nets):
-            raise ValueError("a backbone is there twice")
+            raise ValueError("a backbone is given twice")
         return nets
 
 
@@ -275,7 +275,10 @@ class ReportConfig(StageConfig):
 
 
 class PipelineConfig(StageConfig):
-    """All stages of one run."""
+    """All stages of one run.
+
+    The defaults of its fields are no profile: what is run without settings is `PROFILES["balanced"]`.
+    """
 
     not_in_keys: ClassVar[frozenset[str]] = frozenset({"device"})
     """Stages count the device they ran on: `auto` would be another on another machine."""

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from extrags.depth.frames import PosedFrames
-from extrags.depth.stereo import SATURATED, SURE_AGREEMENT, StereoDepth
+from extrags.depth.stereo import NEARLY_SATURATED, SURE_AGREEMENT, StereoDepth
 
 __all__ = [
     "INPUT_CHANNELS",
@@ -84,7 +84,7 @@ def completion_inputs(
         logs = torch.log(points.clamp_min(1e-9)) - log_scale[:, None, None]
         at_points = torch.where(points > 0, logs.clamp(-FARTHEST_LOG, FARTHEST_LOG), 0.0)
     rays = frames.rays[:, :2]
-    saturated = (frames.rgb.amax(dim=1) >= SATURATED).float()
+    saturated = (frames.rgb.amax(dim=1) >= NEARLY_SATURATED).float()
     single = [
         relative,
         prior,

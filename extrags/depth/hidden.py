@@ -18,7 +18,7 @@ from torch.nn import functional
 from extrags.depth.completion import CompletionInputs, CompletionNetwork, completion_inputs
 from extrags.depth.frames import PosedFrames
 from extrags.depth.shading import fit_shading, smoothed_brightness
-from extrags.depth.stereo import SATURATED, StereoDepth
+from extrags.depth.stereo import NEARLY_SATURATED, StereoDepth
 from extrags.threads import in_threads, one_torch_thread
 from extrags.thresholds import HOLE_ALPHA
 from extrags.view_synthesis.filling import push_pull
@@ -214,7 +214,7 @@ def _as_stereo(
     # Poses play no part: nothing is matched.
     frames = PosedFrames(rgb, torch.ones_like(known), K, torch.eye(4).expand(len(rgb), 4, 4))
     brightness = smoothed_brightness(frames)
-    (fit,) = fit_shading(brightness, log_depth, known & (rgb.amax(dim=1) < SATURATED))
+    (fit,) = fit_shading(brightness, log_depth, known & (rgb.amax(dim=1) < NEARLY_SATURATED))
     confirmed = known.to(log_depth.dtype)
     nothing = torch.zeros_like(confirmed)
     stereo = StereoDepth(

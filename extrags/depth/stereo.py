@@ -30,8 +30,10 @@ __all__ = [
     "sweep_around",
 ]
 
-SATURATED = 0.97
-"""Brightness above which a pixel says nothing about its distance."""
+NEARLY_SATURATED = 0.97
+"""Brightness in [0, 1] from which a pixel says nothing about its distance. It is below the 250 of 255 (0.98)
+of `extrags.thresholds.SATURATED`: frames are made smaller before they are matched, which mixes saturated
+pixels with their neighbours."""
 
 COST_LEVELS = 127.5
 """Levels per unit of the costs that are kept as bytes."""
@@ -210,7 +212,7 @@ def multi_view_stereo(
     agreed = [agreement(frames, depth, part, sources[part], tolerance=settings.tolerance) for part in parts]
     count = (sources >= 0).sum(1)
     sure = torch.cat([a.agrees * a.seen for a in agreed]) * count[:, None, None] >= SURE_AGREEMENT
-    sure &= frames.mask & (frames.rgb.amax(dim=1) < SATURATED)
+    sure &= frames.mask & (frames.rgb.amax(dim=1) < NEARLY_SATURATED)
     fits = fit_shading(brightness, depth.log(), sure, recording)
     prior, monocular_fits = shading_prior(fits, brightness, recording), []
     if not settings.shading:

@@ -140,7 +140,7 @@ def compare_runs(runs: Sequence[Run], baseline: str) -> dict[str, Any]:
     for run in runs:
         key = (run["method"], *_identity(run))
         if key in seen:
-            raise ConfigError(f"the run {key} is there twice")
+            raise ConfigError(f"the run {key} is given twice")
         seen.add(key)
     measured = [run for run in runs if run["metrics"] is not None]
     known = [

@@ -56,7 +56,7 @@ class MappedLens:
     Args:
         model: COLMAP's reconstruction, or None where there is none.
         calibration: the lens, and whether it is an estimate.
-        models: registered frames of each model of the last mapping, descending.
+        model_sizes: registered frames of each model of the last mapping, descending.
     """
 
     model: Any

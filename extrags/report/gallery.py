@@ -42,6 +42,8 @@ class GalleryRun:
         profile: of its settings.
         pseudo: its virtual views; None where there are none.
         held_out: what is to be said of a scene that has seen held-out frames, or may have; else empty.
+        source: what the frames are, in words; empty where the catalogue does not know them.
+        licence: of the frames, from which all pictures derive; empty where it is not known.
     """
 
     sequence: EndoscopicSequence
@@ -51,6 +53,8 @@ class GalleryRun:
     profile: str = ""
     pseudo: PseudoLike | None = None
     held_out: str = ""
+    source: str = ""
+    licence: str = ""
 
 
 def build_gallery(
@@ -128,7 +132,7 @@ def _strip(run: GalleryRun, folder: Path, largest_bytes: int, number_of_run: int
         cells.append(ImageCell(error.image, "Error, final", error.alt))
         said["Error, final"] = f"{table.scales[0].low} dark to {table.scales[0].high} pale"
     said["Truth"] = f"frame {sequence.frame_name(frame)}"
-    lines = [f"## {_plain(sequence.name)}\n", _summary(run, kinds, metrics) + "\n"]
+    lines = [f"## {_plain(sequence.name)}\n", _summary(run, kinds, metrics) + "\n", _terms(run) + "\n"]
     lines.append(_table(cells, said, folder, f"{name}_view"))
     if run.pseudo is not None and len(run.pseudo.rendered):
         virtual = virtual_rows(run.pseudo, sequence, 1, largest_bytes)
@@ -152,6 +156,13 @@ def _summary(run: GalleryRun, kinds: Sequence[str], metrics: Sequence[Metric]) -
     scenes = " → ".join(LABELS[kind].lower() for kind in kinds)
     said = f" {run.held_out}." if run.held_out else ""
     return f"{text}Means of {views} held-out views, {scenes}: {', '.join(changes)}.{said}"
+
+
+def _terms(run: GalleryRun) -> str:
+    """Where the pictures come from, and under which licence that is."""
+    if not run.licence:
+        return "The catalogue knows no licence of these frames: ask whose they are before pictures are shown."
+    return f"Pictures derive from: {_plain(run.source)}. Licence: {_plain(run.licence)}."
 
 
 def _figures(view: Mapping[str, Any], metrics: Sequence[Metric]) -> str:

@@ -16,7 +16,7 @@ from extrags.errors import ConfigError
 from extrags.metrics.registry import figures
 from flows.commands import bench_compare, bench_explore, bench_pipeline, bench_stability
 from flows.commands.common import items, set_up_logging, write_json
-from flows.commands.options import Parser, add_json, add_profile, add_settings, add_verb
+from flows.commands.options import Parser, add_json, add_profile, add_sequences, add_settings, add_verb
 
 __all__ = ["add_arguments", "enhance", "raster", "train"]
 
@@ -50,7 +50,7 @@ def add_arguments(parser: Parser) -> None:
         _add_kernel_cases(made, with_error=with_error)
         add_json(made)
     raw: dict[str, Any] = {"formatter_class": argparse.RawDescriptionHelpFormatter}
-    summary = "every part at the edges of what it can be given"
+    summary = "stress-test every component with extreme inputs"
     bench_stability.add_arguments(
         add_verb(
             verbs, "stability", bench_stability.stability, summary, epilog=bench_stability.EXAMPLES, **raw
@@ -98,7 +98,7 @@ def _add_enhance(parser: Parser) -> None:
         "Reconstruct each sequence, restore its held-out views with every method, and compare with what they "
         "really look like: whole, well seen, holes, observed and unobserved."
     )
-    parser.add_argument("sequences", nargs="+", metavar="SEQUENCE")
+    add_sequences(parser, chosen=False)
     parser.add_argument(
         "--methods",
         nargs="+",

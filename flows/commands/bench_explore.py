@@ -8,7 +8,7 @@ from typing import Any
 
 from extrags.errors import ConfigError
 from flows.commands.common import items, set_up_logging, store_root, write_json
-from flows.commands.options import Parser, add_json, add_profile, add_settings, add_store
+from flows.commands.options import Parser, add_json, add_profile, add_sequences, add_settings, add_store
 
 __all__ = ["add_arguments", "explore"]
 
@@ -26,16 +26,16 @@ def add_arguments(parser: Parser) -> None:
         "Reconstruct each sequence once per seed, choose virtual views in each way, and measure what they "
         "show of the true surface: of what training never saw (seen at all, and seen well), of what it saw "
         "badly, and of the never-observed pixels of held-out frames. For sequences with a true surface: "
-        "phantoms, and recordings with true depth. `clairvoyant` and `oracle` know the true surface."
+        "phantoms, and recordings with true depth. `clairvoyant` and `free-viewpoint` know the true surface."
     )
-    parser.add_argument("sequences", nargs="+", metavar="SEQUENCE")
+    add_sequences(parser, chosen=False)
     parser.add_argument(
         "--ways",
         nargs="+",
         default=[],
         metavar="WAY",
         help="extrags, paper, paper-no-illumination, paper-no-fold, exploregs, frontier, random, perturbed, "
-        "clairvoyant, oracle (default: all)",
+        "clairvoyant, free-viewpoint (default: all)",
     )
     parser.add_argument(
         "--views",

@@ -11,7 +11,7 @@ from typing import Any
 from extrags.errors import ConfigError
 from flows.commands.benchmark import parsed_seeds
 from flows.commands.common import items, set_up_logging, write_json
-from flows.commands.options import Parser, add_json, add_settings
+from flows.commands.options import Parser, add_json, add_output, add_sequences, add_settings
 
 __all__ = ["EXAMPLES", "add_arguments", "pipeline"]
 
@@ -30,17 +30,45 @@ A budget reaches the methods that have the stage and do not pin the setting."""
 
 def add_arguments(parser: Parser) -> None:
     """The options of `extrags bench pipeline`."""
+    from extrags.config import PROFILES
+    from flows.budgets import PRESETS, SET_PRESETS
+    from flows.methods import METHODS
+
     parser.description = (
         "Run every method with every budget, measure what it costs and how good it is, and find the runs "
         "that no other beats in both. Each run is measured in a process of its own; nothing is taken from "
         "any store but the grid's, which begins empty. Called again, it goes on where it was, and runs anew "
         "what reads files that were changed. Exit code 1 when a run failed."
     )
-    parser.add_argument("sequences", nargs="+", metavar="SEQUENCE")
-    parser.add_argument("--methods", nargs="+", default=["coarse", "extrags"], metavar="METHOD")
-    parser.add_argument("--profiles", nargs="+", default=["quick"], metavar="PROFILE")
-    parser.add_argument("--budgets", nargs="+", default=[], metavar="PRESET")
-    parser.add_argument("--vary", action="append", default=[], metavar="NAME=V,V")
+    add_sequences(parser, chosen=True)
+    parser.add_argument(
+        "--methods",
+        nargs="+",
+        default=["coarse", "extrags"],
+        metavar="METHOD",
+        help=f"of {', '.join(METHODS)} (default: coarse extrags)",
+    )
+    parser.add_argument(
+        "--profiles",
+        nargs="+",
+        default=["quick"],
+        metavar="PROFILE",
+        help=f"of {', '.join(PROFILES)} (default: quick)",
+    )
+    parser.add_argument(
+        "--budgets",
+        nargs="+",
+        default=[],
+        metavar="PRESET",
+        help=f"of {', '.join((*PRESETS, *SET_PRESETS))}: see below (default: the profile's settings alone)",
+    )
+    parser.add_argument(
+        "--vary",
+        action="append",
+        default=[],
+        metavar="NAME=V,V",
+        help="values of a setting, each of them a budget: see below; repeatable",
+    )
     parser.add_argument("--seeds", nargs="+", default=["0"], metavar="N", help="e.g. 0,1,2 (default: 0)")
     parser.add_argument(
         "--repeats", type=int, default=1, metavar="N", help="measure everything N times (default: 1)"
@@ -48,14 +76,13 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument(
         "--separate",
         action="store_true",
-        help="make nothing once for several runs; without, what they share is made once and each is charged "
-        "its time",
+        help="do not share stages between runs (default: compute once, charge its time to each)",
     )
-    parser.add_argument(
-        "--output",
+    add_output(
+        parser,
+        "DIR",
         type=Path,
         default=Path("bench-pipeline"),
-        metavar="DIR",
         help="folder of the grid: stores, finished runs, grid.md, fronts.svg, results.json "
         "(default: bench-pipeline)",
     )

@@ -17,7 +17,7 @@ from flows.commands.common import (
     store_root,
     write_json,
 )
-from flows.commands.options import Parser, add_json, add_runner, add_settings, add_store
+from flows.commands.options import Parser, add_json, add_runner, add_sequences, add_settings, add_store
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -36,7 +36,7 @@ def add_arguments(parser: Parser) -> None:
         "store already is taken from there with the time it took when it was made."
     )
     parser.set_defaults(command=benchmark)
-    parser.add_argument("sequences", nargs="+", metavar="SEQUENCE")
+    add_sequences(parser, chosen=True)
     parser.add_argument(
         "--methods",
         nargs="+",
@@ -167,7 +167,7 @@ def parsed_seeds(given: list[str]) -> list[int]:
     """`["0,1", "2"]` to `[0, 1, 2]`.
 
     Raises:
-        ConfigError: for anything but whole numbers from 0 to `LARGEST_SEED`, or a seed that is there twice.
+        ConfigError: for anything but whole numbers from 0 to `LARGEST_SEED`, or a seed that is given twice.
     """
     texts = items(given)
     for text in texts:
@@ -185,7 +185,7 @@ def parsed_variants(given: list[list[str]]) -> dict[str, dict[str, Any]]:
     """`[["dim", "coarse", "coarse.light.exponent=1"]]` to `{"dim": {"method": ..., "coarse...": 1}}`.
 
     Raises:
-        ConfigError: for a variant without settings, or a name that is there twice.
+        ConfigError: for a variant without settings, or a name that is given twice.
     """
     variants: dict[str, dict[str, Any]] = {}
     for name, *rest in given:
@@ -197,7 +197,7 @@ def parsed_variants(given: list[list[str]]) -> dict[str, dict[str, Any]]:
                 "e.g. no-light coarse coarse.light.enabled=false"
             )
         if name in variants:
-            raise ConfigError(f"--variant {name} is there twice")
+            raise ConfigError(f"--variant {name} is given twice")
         variants[name] = {**({"method": bases[0]} if bases else {}), **changed}
     return variants
 

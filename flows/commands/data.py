@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from extrags.errors import SourceNotFoundError, StoreError, UnknownSequenceError
 from flows.commands.common import counted, set_up_logging, write_json
-from flows.commands.options import Parser, add_json, add_settings, add_verb
+from flows.commands.options import Parser, add_json, add_sequence, add_settings, add_verb
 
 if TYPE_CHECKING:
     from data_catalog import Descriptor
@@ -27,7 +27,7 @@ def add_arguments(parser: Parser) -> None:
     made.add_argument("--here", action="store_true", help="only those whose data are on this machine")
     add_json(made)
     made = add_verb(verbs, "show", show, "what is known about one sequence, and what its frames hold")
-    made.add_argument("sequence", metavar="SEQUENCE")
+    add_sequence(made)
     add_settings(made, "ingest")
     made.add_argument(
         "--picture",
@@ -43,7 +43,12 @@ def add_arguments(parser: Parser) -> None:
         description="Read a source and say what is wrong with it: axes, pose direction, depth scale, mask "
         "polarity, intrinsics, exposure, parallax, names. Exit code 1 when anything is.",
     )
-    made.add_argument("sources", nargs="+", metavar="PATH|SEQUENCE")
+    made.add_argument(
+        "sources",
+        nargs="+",
+        metavar="PATH|SEQUENCE",
+        help="paths of folders, videos or DICOM files, or names in the catalogue",
+    )
     add_settings(made, "ingest")
     add_json(made)
 

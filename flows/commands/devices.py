@@ -14,7 +14,7 @@ def add_arguments(parser: Parser) -> None:
     """The options of `extrags devices`."""
     parser.description = (
         "Say of each stage of a run with these settings where it would work on this machine, with which "
-        "rasteriser, and why. Nothing is run. What cannot be had is refused here as `extrags run` refuses it."
+        "rasteriser, and why. Nothing is run. What is unavailable is refused as `extrags run` refuses it."
     )
     parser.set_defaults(command=devices)
     add_method(parser)
@@ -25,7 +25,7 @@ def devices(given: argparse.Namespace) -> int:
     """`extrags devices`.
 
     Raises:
-        ConfigError: for a device that cannot be had; names the setting.
+        ConfigError: for a device that is unavailable; names the setting.
     """
     set_up_logging(debug=given.debug, terminal=True, quiet=given.quiet)
     from extrags.placement import placements

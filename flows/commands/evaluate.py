@@ -17,7 +17,7 @@ from flows.commands.common import (
     store_root,
     write_json,
 )
-from flows.commands.options import Parser, add_json, add_method
+from flows.commands.options import Parser, add_json, add_method, add_sequence
 
 __all__ = ["add_arguments", "evaluate"]
 
@@ -33,7 +33,7 @@ def add_arguments(parser: Parser) -> None:
         "without --renders, show the figures of a run that is in the store."
     )
     parser.set_defaults(command=evaluate)
-    parser.add_argument("sequence", metavar="SEQUENCE")
+    add_sequence(parser)
     parser.add_argument(
         "--renders",
         metavar="FOLDER",

@@ -8,7 +8,7 @@ from pathlib import Path
 from extrags.errors import ConfigError, StoreError
 from flows.commands.common import counted, set_up_logging
 from flows.commands.export_scene import ALONG
-from flows.commands.options import Parser, add_method
+from flows.commands.options import Parser, add_method, add_output, add_sequence
 
 __all__ = ["add_arguments", "export"]
 
@@ -54,7 +54,7 @@ def add_arguments(parser: Parser) -> None:
         "are taken from its store."
     )
     parser.set_defaults(command=export)
-    parser.add_argument("sequence", metavar="SEQUENCE")
+    add_sequence(parser)
     add_method(parser)
     parser.add_argument(
         "--to",
@@ -66,14 +66,7 @@ def add_arguments(parser: Parser) -> None:
         "camera-path: JSON of nerfstudio's viewer; video: H.264; colmap, colmap-text, transforms: the "
         "sequence (default: ply)",
     )
-    parser.add_argument(
-        "-o",
-        "--output",
-        "--out",
-        required=True,
-        metavar="FILE|DIR",
-        help="file, or folder of a sequence, to write",
-    )
+    add_output(parser, "FILE|DIR", required=True, help="file, or folder of a sequence, to write")
     parser.add_argument(
         "--scene",
         choices=("final", "coarse"),

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from extrags.errors import ConfigError, StoreError
 from flows.commands.common import items, run_options, set_up_logging, store_root, without_folders
-from flows.commands.options import Parser, add_store
+from flows.commands.options import Parser, add_output, add_store
 
 if TYPE_CHECKING:
     from flows.outcome_records import OutcomeRecord
@@ -51,9 +51,7 @@ def add_arguments(parser: Parser) -> None:
         metavar="N",
         help="bound on all images together (default: %(default)s)",
     )
-    parser.add_argument(
-        "-o", "--out", metavar="FOLDER", default="gallery", help="for page and images (default: %(default)s)"
-    )
+    add_output(parser, "FOLDER", default="gallery", help="for page and images (default: %(default)s)")
 
 
 def gallery(given: argparse.Namespace) -> int:
@@ -83,7 +81,7 @@ def gallery(given: argparse.Namespace) -> int:
     try:
         page = build_gallery(
             runs,
-            Path(given.out),
+            Path(given.output),
             title=given.name,
             command=_commands([run.record for run in chosen if run.record is not None], given),
             largest_bytes=1000 * given.kb,
@@ -108,6 +106,7 @@ def _commands(runs: Sequence[OutcomeRecord], given: argparse.Namespace) -> str:
     )
     options += "" if given.name == TITLE else f" --name {shlex.quote(given.name)}"
     options += "" if given.kb == LARGEST_KB else f" --kb {given.kb}"
-    out = "" if Path(given.out).is_absolute() else f" --out {shlex.quote(Path(given.out).as_posix())}"
+    place = Path(given.output)
+    output = "" if place.is_absolute() else f" --output {shlex.quote(place.as_posix())}"
     names = " ".join(shlex.quote(without_folders(run["sequence"])) for run in runs)
-    return "\n".join([*lines, f"extrags gallery {names}{options}{out}"])
+    return "\n".join([*lines, f"extrags gallery {names}{options}{output}"])

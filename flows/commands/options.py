@@ -24,8 +24,11 @@ __all__ = [
     "Parser",
     "add_json",
     "add_method",
+    "add_output",
     "add_profile",
     "add_runner",
+    "add_sequence",
+    "add_sequences",
     "add_settings",
     "add_stages",
     "add_store",
@@ -93,6 +96,46 @@ def add_verb(
     made: Parser = verbs.add_parser(name, help=summary, **{"description": summary, **more})
     made.set_defaults(command=command)
     return made
+
+
+def add_sequence(parser: Parser) -> None:
+    """One sequence, by name or path."""
+    parser.add_argument(
+        "sequence",
+        metavar="SEQUENCE",
+        help="a name in the catalogue (`extrags data list`), or the path of a folder, video or DICOM file",
+    )
+
+
+def add_sequences(parser: Parser, *, chosen: bool, nargs: str = "+") -> None:
+    """Several sequences.
+
+    Args:
+        parser: of a verb.
+        chosen: whether patterns and manifests are understood (`flows.selection.chosen_sequences`).
+        nargs: how many there may be.
+    """
+    parser.add_argument(
+        "sequences",
+        nargs=nargs,
+        metavar="SEQUENCE",
+        help="names, paths, patterns over the catalogue's names ('c3vdv2/*@sparse'), or @FILE for a manifest"
+        if chosen
+        else "names in the catalogue (`extrags data list`), or paths of folders, videos or DICOM files",
+    )
+
+
+def add_output(parser: Parser, metavar: str, **more: Any) -> None:
+    """`-o` and `--output`; `--out`, which some verbs once called it, is understood and not shown.
+
+    Args:
+        parser: of a verb.
+        metavar: what is written, e.g. `FILE`.
+        more: for `add_argument`: at least `help`.
+    """
+    made = parser.add_argument("-o", "--output", metavar=metavar, **more)
+    # Not a name of the action: help and completion list those, and two options could not both be required.
+    parser._option_string_actions["--out"] = made
 
 
 def add_store(parser: Parser) -> None:
@@ -183,7 +226,9 @@ def add_profile(parser: Parser, usual: str = DEFAULT_PROFILE) -> None:
         "--profile",
         choices=tuple(PROFILES),
         default=usual,
-        help=f"named settings: a look, a good result, or the paper's counts (default: {usual})",
+        help="preset: quick (preview), balanced (default) or paper (the paper's iteration counts)"
+        if usual == DEFAULT_PROFILE
+        else f"preset: quick (preview), balanced or paper (the paper's iteration counts) (default: {usual})",
     )
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from extrags.errors import ConfigError, ExtragsError
 from flows.commands.common import write_json
-from flows.commands.options import Parser, add_json, add_method, add_runner
+from flows.commands.options import Parser, add_json, add_method, add_runner, add_sequence
 from flows.commands.run import execute
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ def add_arguments(parser: Parser) -> None:
         "will cost: processor time and memory of a whole run from an empty store, on this machine."
     )
     parser.set_defaults(command=plan)
-    parser.add_argument("sequence", metavar="SEQUENCE")
+    add_sequence(parser)
     parser.add_argument(
         "--before",
         action="store_true",

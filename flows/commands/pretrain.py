@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from extrags.errors import ConfigError
 from flows.commands.common import set_up_logging, showing, training_settings
-from flows.commands.options import Parser
+from flows.commands.options import Parser, add_output
 from flows.commands.pretrain_scenes import SOURCES, make_scenes, scene_sources
 
 if TYPE_CHECKING:
@@ -31,9 +31,7 @@ def add_arguments(parser: Parser) -> None:
         "on two cores. Pretraining scenes that are in the folder already are taken from there."
     )
     parser.set_defaults(command=pretrain)
-    parser.add_argument(
-        "--out", metavar="FOLDER", help="where the weights go; needed unless only scenes are made"
-    )
+    add_output(parser, "FOLDER", help="where the weights go; needed unless only scenes are made")
     parser.add_argument(
         "--scenes-folder",
         default=".extrags/pretraining",
@@ -68,7 +66,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument(
         "--real-textures",
         action="store_true",
-        help="a third of the cavities wear tissue of real laparoscopy frames, which must be had",
+        help="a third of the cavities wear tissue of real laparoscopy frames, which must be installed",
     )
     parser.add_argument(
         "--explored",
@@ -119,7 +117,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument(
         "--without-perceptual",
         action="store_true",
-        help="train without the perceptual distance, whose weights (LPIPS, SqueezeNet) must be had",
+        help="train without the perceptual distance, whose weights (LPIPS, SqueezeNet) must be installed",
     )
     parser.add_argument(
         "--deterministic", action="store_true", help="a plain regression: the baseline of the diffusion"
@@ -215,17 +213,17 @@ def pretrain(given: argparse.Namespace) -> int:
         if given.threads is not None:
             torch.set_num_threads(given.threads)
         if isinstance(config, HiddenDepthConfig):
-            return _told(trained_reader(files, config, begun, Path(given.out), about), given.out)
+            return _told(trained_reader(files, config, begun, Path(given.output), about), given.output)
         if isinstance(config, RefinerConfig):
             refiner = trained_refiner(files, config, restorer, about)
-            refiner.save(Path(given.out))
-            return _told(refiner.record, given.out)
-        checkpoint = Path(given.out) / CHECKPOINT
+            refiner.save(Path(given.output))
+            return _told(refiner.record, given.output)
+        checkpoint = Path(given.output) / CHECKPOINT
         enhancer = trained(files, config, start, checkpoint=checkpoint)
-        replace(enhancer, record={**enhancer.record, **about}).save(Path(given.out), half=True)
+        replace(enhancer, record={**enhancer.record, **about}).save(Path(given.output), half=True)
         if enhancer.record["iterations_made"] >= config.iterations:
             checkpoint.unlink()
-    return _told(enhancer.record, given.out)
+    return _told(enhancer.record, given.output)
 
 
 def _settings(given: argparse.Namespace) -> PretrainingConfig:
@@ -276,15 +274,15 @@ def checked(given: argparse.Namespace, scenes: int, validation_scenes: int, *, p
             raise ConfigError(f"--{name.replace('_', '-')} {value}: expected {least} or more")
     if not 0 <= given.exact_share <= 1:
         raise ConfigError(f"--exact-share {given.exact_share}: expected a number from 0 to 1")
-    if given.out is None and not given.scenes_only:
-        raise ConfigError("--out: where do the weights go? (--scenes-only makes scenes alone)")
+    if given.output is None and not given.scenes_only:
+        raise ConfigError("--output: where do the weights go? (--scenes-only makes scenes alone)")
     if given.real_textures:
         from data_catalog.cavities.real_textures import texture_files
 
         texture_files()
     if perceptual and not given.scenes_only:
         find_weights(None, "squeeze")
-    for folder in (given.out, given.scenes_folder):
+    for folder in (given.output, given.scenes_folder):
         if folder is None:
             continue
         try:

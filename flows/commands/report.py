@@ -7,7 +7,7 @@ import shutil
 
 from extrags.errors import StoreError
 from flows.commands.common import finished_run, set_up_logging
-from flows.commands.options import Parser, add_method
+from flows.commands.options import Parser, add_method, add_output, add_sequence
 
 __all__ = ["add_arguments", "report"]
 
@@ -15,9 +15,9 @@ __all__ = ["add_arguments", "report"]
 def add_arguments(parser: Parser) -> None:
     """The options of `extrags report`."""
     parser.set_defaults(command=report)
-    parser.add_argument("sequence", metavar="SEQUENCE")
+    add_sequence(parser)
     add_method(parser)
-    parser.add_argument("-o", "--output", metavar="FILE", help="also write the page to this file")
+    add_output(parser, "FILE", help="also write the page to this file")
 
 
 def report(given: argparse.Namespace) -> int:

@@ -29,7 +29,7 @@ from flows.commands.common import (
     store_root,
     write_json,
 )
-from flows.commands.options import Parser, add_json, add_method, add_runner, add_stages
+from flows.commands.options import Parser, add_json, add_method, add_runner, add_sequences, add_stages
 from flows.failures import describe_error
 from flows.outcome import DatasetFailedError, DatasetOutcome, SequenceOutcome, StageRow
 
@@ -49,12 +49,7 @@ def add_arguments(parser: Parser) -> None:
         "one sequence does not stop the others."
     )
     parser.set_defaults(command=run)
-    parser.add_argument(
-        "sequences",
-        nargs="*",
-        metavar="SEQUENCE",
-        help="names, paths, patterns over the catalogue's names ('c3vdv2/*@sparse'), or @FILE for a manifest",
-    )
+    add_sequences(parser, chosen=True, nargs="*")
     parser.add_argument(
         "--manifest",
         metavar="FILE",
@@ -79,7 +74,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument(
         "--only",
         choices=("failed", "changed", "missing"),
-        help="only sequences whose last run failed, of which something would be made, or that never ended",
+        help="failed: the last run failed; changed: some stage is out of date; missing: never completed",
     )
     parser.add_argument(
         "--methods",
@@ -179,7 +174,7 @@ def parsed_matrix(given: list[str]) -> dict[str, list[Any]]:
     `enhance.channels=[8,8,16],[16,16,32]`.
 
     Raises:
-        ConfigError: for an unknown setting, one that is there twice, or a wrong value.
+        ConfigError: for an unknown setting, one that is given twice, or a wrong value.
     """
     from extrags.config import PipelineConfig
     from extrags.config.settings import settings_of, unknown_setting
@@ -193,7 +188,7 @@ def parsed_matrix(given: list[str]) -> dict[str, list[Any]]:
         if name not in known:
             raise unknown_setting(name, known)
         if name in matrix:
-            raise ConfigError(f"--matrix {name} is there twice; give all of its values at once")
+            raise ConfigError(f"--matrix {name} is given twice; give all of its values at once")
         # A comma between brackets belongs to the value.
         matrix[name] = [known[name].parse(value) for value in re.split(r",(?![^\[]*\])", values)]
     return matrix

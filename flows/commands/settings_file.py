@@ -27,7 +27,7 @@ def settings_of_file(file: Path) -> dict[str, Any]:
             sets nothing.
 
     Raises:
-        ConfigError: a file that cannot be read, or a setting that is unknown (with the nearest), there twice,
+        ConfigError: a file that cannot be read, or a setting that is unknown (with the nearest), given twice,
             or of a wrong kind or out of range. It names the file.
     """
     from extrags.config import PipelineConfig
@@ -39,7 +39,7 @@ def settings_of_file(file: Path) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for name, value in _entries(_content(file), file, known, groups - {""}):
         if name in found:
-            raise ConfigError(f"--config {file}: {name} is there twice")
+            raise ConfigError(f"--config {file}: {name} is given twice")
         try:
             if name not in known:
                 raise unknown_setting(name, known)
@@ -105,7 +105,7 @@ def _of_json(text: str) -> Any:
         made: dict[str, Any] = {}
         for key, value in pairs:
             if key in made:
-                raise _RepeatedKeyError(f"{key} is there twice")
+                raise _RepeatedKeyError(f"{key} is given twice")
             made[key] = value
         return made
 
@@ -124,7 +124,7 @@ def _of_yaml(text: str) -> Any:
                 if isinstance(key, yaml.ScalarNode):
                     if (key.tag, key.value) in seen:
                         line = key.start_mark.line + 1
-                        raise _RepeatedKeyError(f"{key.value} is there twice, again in line {line}")
+                        raise _RepeatedKeyError(f"{key.value} is given twice, again in line {line}")
                     seen.add((key.tag, key.value))
             return node
 

@@ -20,7 +20,7 @@ from data_catalog import read
 from extrags.config import DepthConfig, PosesConfig
 from extrags.depth.estimate import estimate_depth, posed_frames
 from extrags.depth.shading import fit_shading, smoothed_brightness
-from extrags.depth.stereo import SATURATED
+from extrags.depth.stereo import NEARLY_SATURATED
 from extrags.poses import estimate_poses, with_estimated_poses
 from extrags.sequence import EndoscopicSequence
 from extrags.training.starting import depth_from_points
@@ -76,7 +76,7 @@ def cues(sequence: EndoscopicSequence, *, estimate_the_poses: bool) -> dict[str,
     lit = estimate_depth(training, DepthConfig(completion="none"))
     frames = posed_frames(training)
     sure = frames.mask & torch.from_numpy(stereo.expected_error < SURE_ERROR)
-    sure &= frames.rgb.amax(dim=1) < SATURATED
+    sure &= frames.rgb.amax(dim=1) < NEARLY_SATURATED
     brightness = smoothed_brightness(frames)
     logs = torch.from_numpy(np.log(np.maximum(stereo.depth, 1e-9)))
     group = None if training.recording is None else torch.from_numpy(training.recording)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from data_catalog.clairvoyant import LackingSurface, clairvoyant_clips, oracle_poses
+from data_catalog.clairvoyant import LackingSurface, clairvoyant_clips, free_viewpoint_poses
 from data_catalog.surface_views import SurfaceTruth
 from extrags.cameras import Cameras
 from extrags.config import ExploreConfig
@@ -70,11 +70,11 @@ def test_it_shows_more_than_chance(truth: SurfaceTruth, moves: Moves) -> None:
 
 
 def test_free_poses_need_about_as_many_views_as_there_are_faces(truth: SurfaceTruth, moves: Moves) -> None:
-    clips = oracle_poses(truth, moves, AHEAD, VIEWS, seed=0, pool=200)
+    clips = free_viewpoint_poses(truth, moves, AHEAD, VIEWS, seed=0, pool=200)
     assert [len(clip.views) for clip in clips] == [1] * len(clips)
     found = truth.measure(views_of(clips))
     assert found.after(8)["never_seen"] > 0.9
     # Each choice is the best of the pool, so it is worth no more than the one before.
-    again = oracle_poses(truth, moves, AHEAD, 3, seed=0, pool=200)
+    again = free_viewpoint_poses(truth, moves, AHEAD, 3, seed=0, pool=200)
     assert all(np.array_equal(a.poses, b.poses) for a, b in zip(again, clips[:3], strict=True))
     assert found.never_seen[3] >= truth.measure(SIDES[:3]).never_seen[-1] - 0.1

@@ -8,9 +8,16 @@ import numpy as np
 import pytest
 import torch
 
-from extrags.assessment import assess, probe_views
+from extrags.assessment import assess, measure, probe_views
 from extrags.cameras import rotation_angle_deg
-from extrags.config import AssessConfig, EnhanceConfig, ExploreConfig, FinetuneConfig, PipelineConfig
+from extrags.config import (
+    PROFILES,
+    AssessConfig,
+    EnhanceConfig,
+    ExploreConfig,
+    FinetuneConfig,
+    PipelineConfig,
+)
 from extrags.errors import CaptureError, ConfigError
 from extrags.run_costs import STAGE_TASKS, Workload, packaged_model
 from extrags.scene import Scene
@@ -59,6 +66,13 @@ class TestAssess:
             assert line.budget == ({"judge.enabled": False} if line.run else {})
         assert "on real views alone" in plan.decision("finetune").reason
         assert not plan.applied_to(config()).finetune.judge.enabled
+
+    def test_without_settings_it_is_the_default_profile(self):
+        scene, sequence = with_gap(small_tube()), small_tube().sequence
+        balanced = PROFILES["balanced"]
+        plan = assess(scene, sequence)
+        assert plan == decide(measure(scene, sequence, balanced.assess, balanced.explore.coverage), balanced)
+        assert plan.decision("enhance").run
 
     def test_what_a_decision_saves_is_what_the_stage_would_cost(self):
         plan, settings = ball_plan(), config()

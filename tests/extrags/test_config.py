@@ -87,7 +87,9 @@ class TestConfig:
         assert "\n" not in str(caught.value)
 
     def test_a_wrong_value_may_have_been_there_before(self) -> None:
-        with pytest.raises(ConfigError, match=r"poses\.seed is -1; expected a whole number of at least 0"):
+        with pytest.raises(
+            ConfigError, match=r"poses\.seed is -1; expected a whole number from 0 to 9223372036854775807"
+        ):
             PipelineConfig().with_seed(-1).with_overrides({"coarse.iterations": 7})
 
     def test_seed_reaches_every_stage_that_has_one(self) -> None:

@@ -13,6 +13,7 @@ import extrags
 from extrags.cameras import Cameras, look_at
 from extrags.errors import ConfigError, ExtragsError, PoseError, ShapeError, SourceError
 from extrags.gaussians import Gaussians
+from extrags.in_memory_pipeline import InMemoryPipeline
 from extrags.metrics.protocol import RenderedViews
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence, Split
@@ -211,6 +212,18 @@ class TestArguments:
             extrags.run_pipeline(wrong, extrags.PROFILES["quick"])
         with pytest.raises(SourceError, match=message):
             extrags.reconstruct(wrong, extrags.PROFILES["quick"].coarse)
+
+    def test_a_run_without_settings_is_the_default_profile(
+        self, sequence: EndoscopicSequence, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        used = []
+
+        def noted(pipeline: InMemoryPipeline, until: str) -> None:
+            used.append(pipeline.config)
+
+        monkeypatch.setattr(InMemoryPipeline, "run_stages", noted)
+        extrags.run_pipeline(sequence)
+        assert used == [extrags.PROFILES["balanced"]]
 
     @pytest.mark.usefixtures("unchecked")
     def test_a_name_is_no_sequence(self) -> None:

@@ -7,7 +7,15 @@ from dataclasses import replace
 import pytest
 
 from extrags.config import PROFILES, profile_config
-from extrags.memory_estimate import COMPARED_WIDTH, STEPS, FrameSize, estimate_memory, fitting_settings
+from extrags.memory_estimate import (
+    CLIP_VIEWS,
+    COMPARED_WIDTH,
+    STEPS,
+    FrameSize,
+    estimate_memory,
+    fitting_settings,
+)
+from extrags.restoration.benchmark import evaluation
 from extrags.training.frame_comparison import MAX_WIDTH_PX
 
 THUMBNAILS = FrameSize(60, 52, 225, 180)
@@ -18,6 +26,10 @@ FULL = FrameSize(40, 20, 675, 540)
 
 def test_the_width_at_which_frames_are_compared() -> None:
     assert COMPARED_WIDTH == MAX_WIDTH_PX
+
+
+def test_the_number_of_held_out_views_restored_at_once() -> None:
+    assert CLIP_VIEWS == evaluation.CLIP_VIEWS
 
 
 class TestEstimate:
@@ -61,6 +73,17 @@ class TestEstimate:
             assert estimate_memory(config, size).peak_bytes > usual
         for name, value in (("enhance.max_width", None), ("enhance.max_views", 2000)):
             assert estimate_memory(config.with_overrides({name: value}), FULL).peak_bytes > usual
+
+    def test_the_surface_is_fused_at_the_width_of_its_setting(self) -> None:
+        config, size = profile_config("quick"), FrameSize(100, 80, 1350, 1080)
+
+        def needed(max_width: int) -> int:
+            settings = config.with_overrides({"surface.max_width": max_width})
+            return estimate_memory(settings, size).by_stage["surface"]
+
+        assert needed(160) < needed(320) < needed(640)
+        # No frame is enlarged.
+        assert needed(1350) == needed(5000)
 
     def test_ends_with_the_last_stage_and_leaves_stages_out(self) -> None:
         config = profile_config("balanced")

@@ -31,10 +31,12 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from extrags.store import Store
 from tests.flows.tiny import SEQUENCE, TINY, spared
+
+T = TypeVar("T")
 
 PATIENCE_S = 300.0
 SETTINGS = [part for name, value in TINY.items() for part in ("--set", f"{name}={json.dumps(value)}")]
@@ -95,12 +97,14 @@ class Command:
             self.wait()
 
 
-def wait_for(ready: Callable[[], bool], what: str, seconds: float = PATIENCE_S) -> None:
+def wait_for(ready: Callable[[], T], what: str, seconds: float = PATIENCE_S, *, every_s: float = 0.002) -> T:
+    """What is found, as soon as it counts as true."""
     begun = time.monotonic()
-    while not ready():
+    while not (found := ready()):
         if time.monotonic() - begun > seconds:
             raise TimeoutError(f"{what}: not within {seconds:g} s")
-        time.sleep(0.002)
+        time.sleep(every_s)
+    return found
 
 
 def free_port() -> int:

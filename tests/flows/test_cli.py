@@ -21,6 +21,7 @@ from extrags.stress.rows import Trial
 from flows.cli import VERBS, main, parser
 from flows.commands.common import parsed_settings, run_config
 from flows.outcome import SequenceOutcome
+from tests.documented_json import undocumented
 from tests.flows.tiny import SEQUENCE, settled
 
 pytestmark = pytest.mark.usefixtures("untouched_environment")
@@ -326,7 +327,9 @@ class TestThroughPrefect:
         target = tmp_path / "results.json"
         arguments = ["run", SEQUENCE, *settled(store), "--always-flow", "--json", str(target)]
         assert main(arguments) == 0
-        (sequence,) = json.loads(target.read_text())["sequences"]
+        found = json.loads(target.read_text())
+        assert not undocumented(found, "run")
+        (sequence,) = found["sequences"]
         assert {stage["state"] for stage in sequence["stages"]} == {"cached", "skipped"}
         assert sequence["digests"] == first.digests
 
@@ -341,7 +344,9 @@ class TestThroughPrefect:
         target = tmp_path / "results.json"
         folder = str(tmp_path / "empty")
         assert main(["run", folder, SEQUENCE, *settled(store), "--json", str(target)]) == 1
-        first, second = json.loads(target.read_text())["sequences"]
+        found = json.loads(target.read_text())
+        assert not undocumented(found, "run")
+        first, second = found["sequences"]
         assert (first["status"], second["status"]) == ("failed", "ok")
         # The table wraps where columns are narrow.
         assert "the folder is empty" in first["stages"][0]["reason"]
@@ -385,7 +390,7 @@ class TestBench:
     def test_raster_as_json(self, capsys: pytest.CaptureFixture[str]) -> None:
         assert main(["bench", "raster", *self.SMALL, "--peers", "torch,reference", "--json", "-"]) == 0
         found = json.loads(capsys.readouterr().out)
-        assert {"processor", "cores", "threads", "versions", "commit"} <= set(found["machine"])
+        assert not undocumented(found, "bench-raster")
         named = [(case["width"], case["n_gaussians"], case["backend"]) for case in found["cases"]]
         peers = ("native", "torch", "reference")
         assert named == [(w, n, peer) for w, n in ((24, 40), (32, 60)) for peer in peers]
@@ -403,6 +408,8 @@ class TestBench:
         assert "worst gradient" not in said
         assert main(["bench", "train", *self.SMALL, "--peers", "native", "--error"]) == 0
         assert "worst gradient" in capsys.readouterr().out
+        assert main(["bench", "train", *self.SMALL, "--peers", "direct", "--json", "-"]) == 0
+        assert not undocumented(json.loads(capsys.readouterr().out), "bench-raster")
 
     @pytest.mark.parametrize(
         ("arguments", "message"),
@@ -430,6 +437,7 @@ class TestBench:
         chosen = ["--rows", "rasteriser/not finite", "Adam", "--scenes", "5", "--iterations", "20"]
         assert main(["bench", "stability", *chosen, "--json", str(target)]) == 0
         found = json.loads(target.read_text())
+        assert not undocumented(found, "bench-stability")
         assert {row["part"] for row in found["rows"]} == {"rasteriser", "Adam"}
         assert found["effort"] == {"scenes": 5, "iterations": 20, "largest": 100_000}
         assert all(row["passed"] and row["worst"] <= row["limit"] for row in found["rows"])

@@ -135,17 +135,17 @@ class TestWrongFiles:
             ("coarser: {iterations: 5}", "no setting coarser"),
             ("coarse: 5", "coarse is a group of settings; name one of iterations"),
             ("coarse.iterations: many", "setting coarse.iterations is many; expected a whole number of at"),
-            ("{coarse.iterations: 5, coarse: {iterations: 6}}", "coarse.iterations is there twice"),
+            ("{coarse.iterations: 5, coarse: {iterations: 6}}", "coarse.iterations is given twice"),
             ("coarse: {3: 4}", "coarse.3: expected the name of a setting or a group"),
             ("- coarse", "expected settings by name, e.g. coarse.iterations: 500"),
             ("coarse: [", "is no YAML: "),
             ("profile: quick", "no setting profile; settings begin with"),
             (
                 "coarse.iterations: 500\ncoarse.iterations: 700",
-                "coarse.iterations is there twice, again in line 2",
+                "coarse.iterations is given twice, again in line 2",
             ),
-            ("coarse:\n  iterations: 5\n  'iterations': 5", "iterations is there twice, again in line 3"),
-            ("coarse: {iterations: 5}\ncoarse: {max_points: 9}", "coarse is there twice, again in line 2"),
+            ("coarse:\n  iterations: 5\n  'iterations': 5", "iterations is given twice, again in line 3"),
+            ("coarse: {iterations: 5}\ncoarse: {max_points: 9}", "coarse is given twice, again in line 2"),
             ("coarse.iterations: true", "setting coarse.iterations is true; expected a whole number of at"),
             ("coarse: {iterations: yes}", "setting coarse.iterations is true; expected a whole number of at"),
             ("coarse.light.exponent: off", "setting coarse.light.exponent is false; expected a number"),
@@ -186,7 +186,7 @@ class TestWrongFiles:
         made.write_text(content)
         with pytest.raises(ConfigError) as caught:
             parsed("--config", str(made))
-        assert str(caught.value) == f"--config {made}: coarse.iterations is there twice"
+        assert str(caught.value) == f"--config {made}: coarse.iterations is given twice"
 
     def test_true_among_numbers(self, file: Path) -> None:
         name = next(

@@ -15,6 +15,7 @@ from flows.cases import SequenceCase, record_outcome
 from flows.cli import main
 from flows.outcome import SequenceOutcome, StageRow
 from flows.outcome_records import outcome_records
+from tests.documented_json import undocumented
 from tests.flows.tiny import SEQUENCE, TINY, settled
 
 pytestmark = pytest.mark.usefixtures("untouched_environment")
@@ -30,7 +31,7 @@ class TestFinished:
         target = tmp_path / "deep" / "results.json"
         assert main(["run", SEQUENCE, *settled(store), "--json", str(target), "--until", "evaluate"]) == 0
         results = json.loads(target.read_text())
-        assert set(results) >= {"seconds", "sequences"}
+        assert not undocumented(results, "run")
         (sequence,) = results["sequences"]
         assert sequence["name"] == SEQUENCE
         assert sequence["status"] == "ok"
@@ -95,10 +96,15 @@ class TestFinished:
         store, _ = finished
         assert main(["plan", SEQUENCE, *settled(store), "--json", "-"]) == 0
         plan = json.loads(capsys.readouterr().out)
+        assert not undocumented(plan, "plan")
         assert plan["sequence"] == SEQUENCE
         assert {line["stage"] for line in plan["decisions"]} >= {"explore", "enhance", "finetune"}
         assert all(line["saves_s"] is not None for line in plan["decisions"])
         assert plan["without_plan"]["processor_seconds"] >= plan["predicted"]["processor_seconds"] > 0
+        assert main(["plan", SEQUENCE, *settled(store), "--before", "--json", "-"]) == 0
+        before = json.loads(capsys.readouterr().out)
+        assert not undocumented(before, "plan")
+        assert set(before) == {"sequence", "predicted"}
 
     def test_report_is_built_again(
         self, finished: tuple[str, SequenceOutcome], tmp_path: Path, capsys: pytest.CaptureFixture[str]

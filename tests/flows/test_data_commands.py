@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +21,8 @@ from flows.methods import method_config
 from flows.runners import DirectRunner
 from flows.wiring import run_sequence
 from tests.flows.tiny import SEQUENCE, TINY
+
+pytestmark = pytest.mark.usefixtures("untouched_environment")
 
 SMALL = ["--set", "ingest.width=48", "--set", "ingest.max_frames=8"]
 
@@ -51,15 +51,6 @@ def refined(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, PipelineConf
     config = method_config("extrags", "quick", REFINING)
     outcome = run_sequence(SEQUENCE, config, store, DirectRunner(store), until="coarse")
     return store, config, Store(store).load(EndoscopicSequence, outcome.refs["sequence"])
-
-
-@pytest.fixture(autouse=True)
-def untouched_environment() -> Iterator[None]:
-    """The command sets up Prefect through the environment; put it back."""
-    before = dict(os.environ)
-    yield
-    os.environ.clear()
-    os.environ.update(before)
 
 
 class TestList:

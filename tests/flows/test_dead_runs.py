@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ import flows.leases
 from extrags.store import Store
 from flows.automation import NAME, dead_run_automation, provide_automation
 from flows.leases import run_lease, settle_dead_runs
+from tests.flows.killing import wait_for
 
 pytestmark = pytest.mark.usefixtures("prefect_server")
 
@@ -86,18 +87,11 @@ def task_states(run: UUID) -> set[StateType | None]:
         return {task.state_type for task in client.read_task_runs(task_run_filter=chosen)}
 
 
-def wait_for(ready: Callable[[], bool]) -> None:
-    begun = time.monotonic()
-    while not ready():
-        assert time.monotonic() - begun < PATIENCE_S
-        time.sleep(0.2)
-
-
 def test_a_killed_run_is_crashed_at_the_next_start_and_the_living_are_left_alone(tmp_path: Path) -> None:
     with running(tmp_path, "reconstruct-sequence", "reconstruct-dataset", "of-another-project") as runs:
         (killed, dead), (_, living), (stranger, foreign) = runs
         # Task runs reach the server a moment after they begin.
-        wait_for(lambda: task_states(dead) == {StateType.RUNNING})
+        wait_for(lambda: task_states(dead) == {StateType.RUNNING}, "the task to run", PATIENCE_S, every_s=0.2)
         assert settle_dead_runs(str(tmp_path)) == ([], set())
         for process in (killed, stranger):
             process.send_signal(signal.SIGKILL)

@@ -8,8 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ import pytest
 from extrags.errors import ConfigError
 from flows.cli import main
 from flows.deployments import chosen_deployments, declared_deployments, usual_file
+from tests.flows.killing import wait_for
 from tests.flows.tiny import SEQUENCE, TINY
 
 REPOSITORY = Path(__file__).parents[2]
@@ -185,16 +185,6 @@ def process(
             started.wait()
 
 
-def wait_for(condition: Callable[[], Any], what: str) -> Any:
-    end = time.monotonic() + PATIENCE_S
-    while time.monotonic() < end:
-        found = condition()
-        if found:
-            return found
-        time.sleep(0.25)
-    raise AssertionError(f"{what}: not within {PATIENCE_S:g} s")
-
-
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("operator")
@@ -220,7 +210,7 @@ def environment(place: Path) -> Iterator[dict[str, str]]:
     environment.pop("EXTRAGS_STORE", None)
     server = [prefect(), "server", "start", "--host", "127.0.0.1", "--port", str(port), "--no-ui"]
     with process(server, place, environment):
-        wait_for(lambda: is_up(environment), "the server")
+        wait_for(lambda: is_up(environment), "the server", PATIENCE_S, every_s=0.25)
         yield environment
 
 
@@ -287,7 +277,7 @@ class TestRealServer:
         command = [extrags(), "serve", "nightly", "--store", str(place / "served-store")]
         with process(command, elsewhere, deployed):
             log = elsewhere / "extrags-serve.log"
-            wait_for(lambda: "being served" in log.read_text(), "extrags serve")
+            wait_for(lambda: "being served" in log.read_text(), "extrags serve", PATIENCE_S, every_s=0.25)
             assert [item["active"] for item in deployment(deployed, "nightly")["schedules"]] == [False]
             done = run_deployment(
                 deployed,
@@ -363,4 +353,4 @@ def finished(environment: dict[str, str], *, name: str) -> str:
         types = [run["state_type"] for run in runs]
         return types[0] if types and types[0] in ("COMPLETED", "FAILED", "CRASHED", "CANCELLED") else None
 
-    return str(wait_for(state, name))
+    return str(wait_for(state, name, PATIENCE_S, every_s=0.25))

@@ -19,6 +19,7 @@ from flows.commands.common import items
 from flows.outcome import SequenceOutcome
 from flows.runners import DirectRunner
 from flows.wiring import run_sequence
+from tests.documented_json import undocumented
 from tests.flows.tiny import SEQUENCE, TINY, tiny_config
 
 pytestmark = pytest.mark.usefixtures("untouched_environment")
@@ -68,6 +69,7 @@ class TestEvaluate:
         more = ["--renders", str(folders / "renders"), "--depth", str(folders / "depth"), "--json", "-"]
         assert main(["evaluate", SEQUENCE, *settled(store), *more]) == 0
         found = json.loads(capsys.readouterr().out)
+        assert not undocumented(found, "evaluate")
         ours = outcome.metrics["final"]
         for name in set(ours) - {"n_gaussians", "surface"}:
             assert found["metrics"][name] == ours[name], name
@@ -167,6 +169,7 @@ class TestBenchmark:
         arguments = ["--methods", "coarse,extrags", "--seeds", "0", "--store", store, *SETTINGS]
         assert main(["benchmark", SEQUENCE, *arguments, "--json", str(target)]) == 0
         found = json.loads(target.read_text())
+        assert not undocumented(found, "benchmark")
         assert [case["metrics"] for case in found["cases"]] == [
             outcome.metrics["coarse"],
             outcome.metrics["final"],

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
 import shlex
 import shutil
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,17 +31,10 @@ from flows.wiring import run_sequence
 from tests.extrags.splat_files import decoders
 from tests.flows.tiny import SEQUENCE, TINY, tiny_config
 
+pytestmark = pytest.mark.usefixtures("untouched_environment")
+
 Finished = tuple[str, SequenceOutcome]
 SETTINGS = [part for name, value in TINY.items() for part in ("--set", f"{name}={json.dumps(value)}")]
-
-
-@pytest.fixture(autouse=True)
-def untouched_environment() -> Iterator[None]:
-    """The command sets up Prefect through the environment; put it back."""
-    before = dict(os.environ)
-    yield
-    os.environ.clear()
-    os.environ.update(before)
 
 
 def export(finished: Finished, *arguments: str) -> int:

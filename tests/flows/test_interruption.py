@@ -21,6 +21,7 @@ from flows.interruption import INTERRUPTED
 from flows.outcome import SequenceOutcome
 from flows.runners import DirectRunner
 from flows.wiring import run_sequence
+from tests.flows.killing import wait_for
 from tests.flows.tiny import SEQUENCE, TINY, tiny_config
 
 SETTINGS = [part for name, value in TINY.items() for part in ("--set", f"{name}={json.dumps(value)}")]
@@ -98,15 +99,6 @@ def started(*arguments: str, output: Path, home: Path | None = None) -> Iterator
             process.kill()
 
 
-def wait_for(ready: Callable[[], bool], seconds: float = PATIENCE_S) -> float:
-    """Wait until something is so; returns the seconds it took."""
-    begun = time.monotonic()
-    while not ready():
-        assert time.monotonic() - begun < seconds
-        time.sleep(0.02)
-    return time.monotonic() - begun
-
-
 def is_running(process: int) -> bool:
     try:
         state = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0]
@@ -155,7 +147,11 @@ def test_an_interrupted_run_says_so_ends_at_once_and_resumes(
     output = tmp_path / "output"
     command = ["-m", "flows.cli", "run", SEQUENCE, "--profile", "quick", "--until", "coarse", *SETTINGS]
     with started(*command, "--store", str(begun), output=output, home=home) as process:
-        wait_for(lambda: "coarse: starts" in output.read_text() or process.poll() is not None)
+        wait_for(
+            lambda: "coarse: starts" in output.read_text() or process.poll() is not None,
+            "the stage to start",
+            PATIENCE_S,
+        )
         server = children(process.pid)
         assert server
         send(process)
@@ -179,7 +175,7 @@ def test_an_interrupted_run_says_so_ends_at_once_and_resumes(
 def test_a_main_thread_that_does_not_end_is_ended_with_its_children(tmp_path: Path) -> None:
     output = tmp_path / "output"
     with started("-c", SWALLOWS, STAYS, output=output) as process:
-        wait_for(lambda: output.read_text().endswith("\n"))
+        wait_for(lambda: output.read_text().endswith("\n"), "a line", PATIENCE_S)
         child = int(output.read_text())
         process.send_signal(signal.SIGINT)
         signalled = time.monotonic()
@@ -192,12 +188,12 @@ def test_a_main_thread_that_does_not_end_is_ended_with_its_children(tmp_path: Pa
 def test_the_server_of_a_killed_command_ends(home: Path, tmp_path: Path) -> None:
     output = tmp_path / "output"
     with started("-c", ONLY_A_SERVER, str(tmp_path), output=output, home=home) as process:
-        wait_for(lambda: output.read_text().endswith("\n"))
+        wait_for(lambda: output.read_text().endswith("\n"), "a line", PATIENCE_S)
         server = int(output.read_text())
         assert os.getsid(server) == server
         process.kill()
         process.wait()
-        wait_for(lambda: not is_running(server), END_S)
+        wait_for(lambda: not is_running(server), "the server to end", END_S)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

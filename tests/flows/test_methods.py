@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
 from typing import Any, get_args
 
 import pytest
+import yaml
 
 from extrags.config import PROFILES, CoarseConfig, PipelineConfig
 from extrags.config.settings import settings_of
@@ -114,6 +117,28 @@ def test_the_paper_s_counts_with_its_own_profile() -> None:
     assert (config.ingest.width, config.ingest.height) == (None, None)
     quick = method_config("paper", "quick")
     assert quick.finetune.iterations == method_config("extrags", "quick").finetune.iterations
+
+
+def test_the_documented_settings_of_the_paper_s_search() -> None:
+    """The rows name settings, and the cells give their values in the same order or by name."""
+    page = (Path(__file__).parents[2] / "docs" / "algorithms" / "exploration.md").read_text()
+    heading, _, *rows = re.findall(r"^\|.*", page.split("## The paper's search")[1], re.MULTILINE)
+    columns = re.findall(r"method `([a-z]+)`", heading)
+    assert columns == ["paper", "exploregs"]
+    checked = set()
+    for row in rows:
+        names, *cells = row.strip("| ").split(" | ")
+        for method, cell in zip(columns, cells, strict=True):
+            named = dict(re.findall(r"`([a-z_.]+)` (\S+)", cell))
+            values = named or dict(zip(re.findall(r"`([a-z_.]+)`", names), cell.split(", "), strict=True))
+            config = method_config(method, "paper")
+            for name, value in values.items():
+                assert config.value(name) == yaml.safe_load(value), (method, name)
+            checked |= set(values)
+    assert {"explore.max_expansions", "explore.length", "explore.fold_penalty", "enhance.iou"} <= checked
+    assert "12 and 10 with `quick`" in page
+    quick = method_config("paper", "quick").explore
+    assert (quick.trajectories, quick.length) == (12, 10)
 
 
 def test_the_paper_s_losses() -> None:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import argparse
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from extrags.config import PipelineConfig
-from flows.cli import main
+from flows.cli import VERBS, main, parser
 from flows.commands.options import Parser, add_settings
 
 
@@ -50,3 +52,45 @@ def test_where_no_json_can_be_written_is_said_before_anything_runs(
     for target, problem in ((tmp_path, "is a folder"), (tmp_path / "file" / "x.json", "cannot be written")):
         assert main([*verb, "--json", str(target)]) == 2
         assert problem in capsys.readouterr().err
+
+
+def parsers_of(made: argparse.ArgumentParser, name: str) -> Iterator[tuple[str, argparse.ArgumentParser]]:
+    """A parser, and those of the verbs below it."""
+    yield name, made
+    for action in made._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for verb, below in action.choices.items():
+                yield from parsers_of(below, f"{name} {verb}")
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_argument_is_explained(verb: str) -> None:
+    (verbs,) = (action for action in parser(verb)._actions if isinstance(action.choices, dict))
+    assert isinstance(verbs.choices, dict)
+    for name, made in parsers_of(verbs.choices[verb], verb):
+        silent = [
+            action.option_strings or action.dest
+            for action in made._actions
+            if not action.help and not isinstance(action, argparse._SubParsersAction)
+        ]
+        assert not silent, name
+
+
+def test_the_output_has_one_spelling_that_is_shown_and_another_that_is_understood() -> None:
+    found = []
+    for verb in VERBS:
+        (verbs,) = (action for action in parser(verb)._actions if isinstance(action.choices, dict))
+        assert isinstance(verbs.choices, dict)
+        for name, made in parsers_of(verbs.choices[verb], verb):
+            known = made._option_string_actions
+            if "--out" not in known and "--output" not in known:
+                continue
+            found.append(name)
+            assert known["--out"] is known["--output"] is known["-o"]
+            assert "--output" in made.format_help()
+            assert "--out " not in made.format_help()
+    assert found == ["report", "compare", "leaderboard", "gallery", "export", "bench pipeline", "pretrain"]
+    (verbs,) = (action for action in parser("export")._actions if isinstance(action.choices, dict))
+    assert isinstance(verbs.choices, dict)
+    for option in ("-o", "--output", "--out"):
+        assert verbs.choices["export"].parse_args(["phantom/0@sparse", option, "x.ply"]).output == "x.ply"

@@ -18,6 +18,7 @@ from flows.cli import main
 from flows.commands.bench_pipeline import grid_markdown
 from flows.pipeline_grid import Cell, cells_of, run_cell, run_grid
 from flows.selection import Chosen
+from tests.documented_json import undocumented
 from tests.flows.tiny import SEQUENCE, TINY
 
 SMALL = {**TINY, "ingest.max_frames": 8}
@@ -176,8 +177,12 @@ def test_the_verbs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "on the front" in capsys.readouterr().out
     assert (tmp_path / "fronts.png").stat().st_size > 1000
     result = tmp_path / "results.json"
+    assert not undocumented(json.loads(result.read_text()), "bench-pipeline")
     assert len(json.loads(result.read_text())["cases"]) == 1
-    assert main(["bench", "compare", str(result), str(result)]) == 0
+    compared = tmp_path / "compared.json"
+    assert main(["bench", "compare", str(result), str(result), "--json", str(compared)]) == 0
+    assert json.loads(compared.read_text())["rows"]
+    assert not undocumented(json.loads(compared.read_text()), "bench-compare")
     worse = json.loads(result.read_text())
     for case in worse["cases"]:
         case["error"] = "coarse: it diverged"

@@ -147,10 +147,12 @@ def test_weights_come_with_what_they_were_made_from(
     common = ["--scenes-folder", str(scenes), "--scenes", "3", "--validation-scenes", "1", "--batch", "2"]
     common += ["--without-perceptual", "--threads", "1"]
     first, second = tmp_path / "first", tmp_path / "second"
-    assert main(["pretrain", "--out", str(first), "--iterations", "2", *common]) == 0
+    assert main(["pretrain", "--output", str(first), "--iterations", "2", *common]) == 0
     out = capsys.readouterr().out
     assert "embedded_1" in out
-    assert main(["pretrain", "--out", str(second), "--iterations", "1", "--start", str(first), *common]) == 0
+    assert (
+        main(["pretrain", "--output", str(second), "--iterations", "1", "--start", str(first), *common]) == 0
+    )
     record = json.loads((second / "restorer.json").read_text())["record"]
     assert "--iterations 1" in record["command"]
     assert "--kinds phantom cavities" in record["command"]
@@ -163,7 +165,7 @@ def test_weights_come_with_what_they_were_made_from(
 def test_any_setting_can_be_given_and_an_ended_training_goes_on(
     scenes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    given = ["pretrain", "--out", str(tmp_path / "w"), "--scenes-folder", str(scenes), "--scenes", "3"]
+    given = ["pretrain", "--output", str(tmp_path / "w"), "--scenes-folder", str(scenes), "--scenes", "3"]
     given += ["--validation-scenes", "1", "--batch", "2", "--without-perceptual", "--threads", "1"]
     given += ["--set", "channels=8,16,16", "--set", "most_seconds=0.001"]
     for made in (1, 2):
@@ -181,15 +183,15 @@ def test_any_setting_can_be_given_and_an_ended_training_goes_on(
 def test_what_would_fail_after_hours_is_said_at_once(
     scenes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out = ["--out", str(tmp_path / "w"), "--scenes-folder", str(scenes)]
+    out = ["--output", str(tmp_path / "w"), "--scenes-folder", str(scenes)]
     assert main(["pretrain", *out, "--scenes", "3", "--validation-scenes", "3"]) == 2
     assert "none is left to train" in capsys.readouterr().err
     assert main(["pretrain", "--scenes-folder", str(scenes)]) == 2
-    assert "--out" in capsys.readouterr().err
+    assert "--output" in capsys.readouterr().err
     assert main(["pretrain", *out, "--workers", "0"]) == 2
     assert "--workers 0" in capsys.readouterr().err
     (tmp_path / "file").write_text("")
-    assert main(["pretrain", "--out", str(tmp_path / "file" / "w"), "--without-perceptual"]) == 2
+    assert main(["pretrain", "--output", str(tmp_path / "file" / "w"), "--without-perceptual"]) == 2
     assert "cannot be written" in capsys.readouterr().err
 
 
@@ -200,7 +202,7 @@ def test_settings_that_do_not_fit_are_told_before_a_scene_is_made(
         raise AssertionError("scenes were made")
 
     monkeypatch.setattr("flows.commands.pretrain.make_scenes", too_late)
-    given = ["pretrain", "--out", str(tmp_path / "w"), "--scenes-folder", str(tmp_path / "scenes")]
+    given = ["pretrain", "--output", str(tmp_path / "w"), "--scenes-folder", str(tmp_path / "scenes")]
     given += ["--scenes", "3", "--validation-scenes", "1", "--without-perceptual"]
     assert main([*given, "--set", "drawing_processes=3"]) == 2
     assert "there are 2 scenes to train on" in capsys.readouterr().err
@@ -253,7 +255,7 @@ class TestRefiner:
         caplog: pytest.LogCaptureFixture,
     ) -> None:
         out = tmp_path / "refiner"
-        assert main([*given, "--out", str(out)]) == 0
+        assert main([*given, "--output", str(out)]) == 0
         assert "textured" in capsys.readouterr().out
         assert "cavities_00000.safetensors: left out" in caplog.text
         record = Refiner.load(out).record
@@ -264,7 +266,7 @@ class TestRefiner:
         kept = sorted((tmp_path / "pretraining" / "refinement").iterdir())
         assert len(kept) == 2
         before = [file.stat().st_mtime_ns for file in kept]
-        assert main([*given, "--out", str(tmp_path / "again")]) == 0
+        assert main([*given, "--output", str(tmp_path / "again")]) == 0
         assert [file.stat().st_mtime_ns for file in kept] == before
 
     def test_a_scene_without_texture_is_done_too(self, tmp_path: Path) -> None:
@@ -278,7 +280,7 @@ class TestRefiner:
     def test_wrong_settings_are_named(
         self, given: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
-        out = ["--out", str(tmp_path / "refiner")]
+        out = ["--output", str(tmp_path / "refiner")]
         assert main([*given, *out, "--set", "drawn_share=0.3"]) == 2
         assert "adversarial_weight" in capsys.readouterr().err
         assert main([*given, *out, "--learning-rate", "-1"]) == 2
@@ -336,7 +338,7 @@ class TestHiddenDepth:
         )
         monkeypatch.setattr(HiddenDepthExamples, "of_recording", explored)
         out = tmp_path / "reader"
-        assert main([*given, "--out", str(out)]) == 0
+        assert main([*given, "--output", str(out)]) == 0
         assert made == ["phantom 0", "cavities 0", "phantom 1"]
         assert "trained" in capsys.readouterr().out
         assert "cavities_00000: left out" in caplog.text
@@ -347,13 +349,13 @@ class TestHiddenDepth:
         weights = load_safetensors(out / "hidden.safetensors")
         CompletionNetwork().load_state_dict({name: value.float() for name, value in weights.items()})
         # What could be explored is kept.
-        assert main([*given, "--out", str(tmp_path / "again")]) == 0
+        assert main([*given, "--output", str(tmp_path / "again")]) == 0
         assert made[3:] == ["cavities 0"]
 
     def test_wrong_settings_are_named(
         self, given: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
-        out = ["--out", str(tmp_path / "reader")]
+        out = ["--output", str(tmp_path / "reader")]
         assert main([*given, *out, "--set", "drawn_share=0.3"]) == 2
         assert "slope_weight" in capsys.readouterr().err
         assert main([*given, *out, "--learning-rate", "-1"]) == 2

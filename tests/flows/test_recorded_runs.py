@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from data_catalog.catalog import describe
 from extrags.errors import ConfigError, StoreError
 from extrags.pipeline import HELD_OUT_TRAINED_ON
 from extrags.sequence import EndoscopicSequence
@@ -190,6 +191,7 @@ def test_gallery_from_the_command_line(
     assert f"{made}\nextrags gallery {SEQUENCE}\n" in text
     assert str(tmp_path) not in text
     assert "Virtual view" in text
+    assert f"Pictures derive from: {describe(SEQUENCE).description}. Licence: Apache-2.0 (generated)." in text
 
 
 def test_the_command_of_a_gallery_has_its_options(store: Store, tmp_path: Path) -> None:

@@ -116,7 +116,7 @@ class TestTables:
         runs = both("phantom/0", 0, 20.0, 1.0)
         with pytest.raises(ConfigError, match="no run of the baseline 'extrags'; methods here: 3dgs, coarse"):
             compare_runs(runs, "extrags")
-        with pytest.raises(ConfigError, match="there twice"):
+        with pytest.raises(ConfigError, match="given twice"):
             compare_runs([*runs, runs[0]], "3dgs")
 
     def test_names(self) -> None:

@@ -56,6 +56,14 @@ def test_the_view_is_the_median_one(run: GalleryRun, tmp_path: Path) -> None:
     assert (shown == run.sequence.rgb[8]).all()
 
 
+def test_source_and_licence_stand_beside_the_pictures(run: GalleryRun, tmp_path: Path) -> None:
+    known = replace(run, source="A colon, ten frames", licence="CC BY-NC-SA 4.0")
+    text = built([known, run], tmp_path)
+    first, second = text.split("\n## ")[1:]
+    assert "Pictures derive from: A colon, ten frames. Licence: CC BY-NC-SA 4.0.\n" in first
+    assert "The catalogue knows no licence of these frames" in second
+
+
 def test_what_no_frame_saw_is_tinted(run: GalleryRun, tmp_path: Path) -> None:
     built([run], tmp_path)
     shown = np.asarray(Image.open(tmp_path / "000_tube_0_sparse_view_4.png")).astype(int)

@@ -22,7 +22,7 @@ from extrags.training.normal_term import NEAREST_EVERY, NormalTerm, normal_loss
 from extrags.training.step import AutogradStep, NativeStep
 from extrags.training.strategies import density_strategy
 from extrags.training.views import real_views
-from tests.extrags.training.test_step import _relative, _scene, _schedule
+from tests.extrags.training.shaken_tube import relative_error, shaken_scene, step_schedule
 
 
 def plain_normal_loss(quats: np.ndarray, log_scales: np.ndarray, normals: np.ndarray) -> float:
@@ -187,11 +187,11 @@ class TestHuber:
 
 @pytest.mark.skipif(native.native_isa() is None, reason="the native kernels are not built")
 def test_both_steps_take_both_terms(tube_sequence: EndoscopicSequence) -> None:
-    scene = _scene(lit=False)
+    scene = shaken_scene(lit=False)
     view = real_views(tube_sequence, tube_sequence.train)[1]
     points = scene.gaussians.means.detach().numpy()
     config = CoarseConfig(normal_weight=0.2, normal_start_share=0.0, iterations=30)
-    with_terms = _schedule(
+    with_terms = step_schedule(
         densify=DensifyConfig(enabled=False),
         depth_huber_delta=0.2,
         depth_weight=0.2,
@@ -208,7 +208,7 @@ def test_both_steps_take_both_terms(tube_sequence: EndoscopicSequence) -> None:
         for parameter in ("means", "quats", "scales", "opacities"):
             wanted = other.adam.parameters[parameter].grad
             assert wanted is not None
-            assert _relative(own.direct.gradients[parameter], wanted) < 1e-4, parameter
+            assert relative_error(own.direct.gradients[parameter], wanted) < 1e-4, parameter
         losses[name] = seen.loss
     depth = seen.rendering.depth[0].double().numpy(), seen.rendering.alpha[0].numpy()
     assert view.depth_mm is not None

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from extrags.config import CoarseConfig, DensifyConfig, LightConfig
+from extrags.config import DensifyConfig
 from extrags.errors import DivergedError, NonFiniteError
 from extrags.gaussians import Gaussians
 from extrags.raster import native, set_num_threads
@@ -15,12 +15,11 @@ from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
 from extrags.training.light_fit import COMMON
 from extrags.training.optimise import optimise
-from extrags.training.reconstruction import coarse_schedule
 from extrags.training.schedule import Schedule
 from extrags.training.step import AutogradStep, NativeStep, TrainingStep, training_step
 from extrags.training.strategies import density_strategy
 from extrags.training.views import View, real_views
-from tests.extrags.training.conftest import tube_gaussians, tube_light
+from tests.extrags.training.shaken_tube import relative_error, shaken_scene, step_schedule
 
 pytestmark = pytest.mark.skipif(native.native_isa() is None, reason="the native kernels are not built")
 
@@ -32,39 +31,6 @@ def threads() -> Iterator[None]:
     before = native.num_threads()
     yield
     native.set_num_threads(before)
-
-
-def _scene(sh_degree: int = 1, *, lit: bool = True) -> Scene:
-    """The tube, shaken: no gradient is zero."""
-    generator = torch.Generator().manual_seed(1)
-    tube = tube_gaussians()
-
-    def noise(value: torch.Tensor, size: float) -> torch.Tensor:
-        return value + size * torch.randn(value.shape, generator=generator)
-
-    n, higher = len(tube), (sh_degree + 1) ** 2 - 1
-    shaken = Gaussians(
-        means=noise(tube.means, 0.1),
-        quats=noise(tube.quats, 0.05),
-        scales=noise(tube.scales, 0.1),
-        opacities=noise(tube.opacities, 0.5),
-        sh0=noise(tube.sh0, 0.05),
-        shN=noise(torch.zeros(n, higher, 3), 0.05),
-    )
-    light = tube_light()
-    light = replace(light, log_exposure=0.1 * torch.randn(6, generator=generator))
-    return Scene(shaken, light if lit else None)
-
-
-def _schedule(iterations: int = 30, **changes: object) -> Schedule:
-    config = CoarseConfig(
-        iterations=iterations, densify=DensifyConfig(enabled=False), light=LightConfig(offset=True)
-    )
-    return replace(coarse_schedule(config, 20.0, 15.0, "coarse", iterations=iterations), **changes)  # type: ignore[arg-type]
-
-
-def _relative(found: torch.Tensor, expected: torch.Tensor) -> float:
-    return float((found.double() - expected.double()).norm() / expected.double().norm().clamp_min(1e-30))
 
 
 def _virtual(view: View) -> View:
@@ -91,8 +57,8 @@ class TestOneStep:
         self, tube_sequence: EndoscopicSequence, setting: str, change: Callable[[View], View], lit: bool
     ) -> None:
         view = change(real_views(tube_sequence, tube_sequence.train)[1])
-        schedule = _schedule(densify=SETTINGS[setting], sh_every=5)
-        scene = _scene(lit=lit)
+        schedule = step_schedule(densify=SETTINGS[setting], sh_every=5)
+        scene = shaken_scene(lit=lit)
         native_step, expected = NativeStep(scene, schedule), AutogradStep(scene, schedule)
         density = density_strategy(schedule.densify, 20.0, 30, len(scene.gaussians), seed=0)
         iteration = 7
@@ -104,13 +70,13 @@ class TestOneStep:
         gradients |= {"sh0": gradients["sh"][:, :1], "shN": gradients["sh"][:, 1:]}
         for name, value in expected.adam.parameters.items():
             assert value.grad is not None
-            assert _relative(gradients[name], value.grad) < 1e-5, name
+            assert relative_error(gradients[name], value.grad) < 1e-5, name
         assert torch.equal(own.visible, other.visible)
         assert torch.equal(own.rendering.radius_px, other.rendering.radius_px)
-        assert _relative(own.rendering.rgb, other.rendering.rgb.detach()) < 1e-6
+        assert relative_error(own.rendering.rgb, other.rendering.rgb.detach()) < 1e-6
         name = "absgrad" if setting == "absgrad" else "grad"
         moved, expected_moved = getattr(own.rendering.means2d, name), getattr(other.rendering.means2d, name)
-        assert _relative(moved, expected_moved) < 1e-5
+        assert relative_error(moved, expected_moved) < 1e-5
         if lit:
             assert native_step.light_fit is not None
             assert expected.light is not None
@@ -118,11 +84,11 @@ class TestOneStep:
             common = native_step.light_fit.common_gradient(row)
             flat = [expected.light.parameters()[name].grad for name in COMMON]
             joined = torch.cat([value.reshape(-1) for value in flat if value is not None])
-            assert _relative(torch.from_numpy(common), joined) < 1e-5
+            assert relative_error(torch.from_numpy(common), joined) < 1e-5
             if view.frame is not None:
                 exposure = torch.from_numpy(native_step.light_fit.exposure_gradient(row))
                 assert expected.light.log_exposure.grad is not None
-                assert _relative(exposure, expected.light.log_exposure.grad) < 1e-5
+                assert relative_error(exposure, expected.light.log_exposure.grad) < 1e-5
 
     @pytest.mark.parametrize("iteration", [3, 4000])
     @pytest.mark.parametrize("degree", [0, 1, 3])
@@ -130,8 +96,8 @@ class TestOneStep:
         self, tube_sequence: EndoscopicSequence, degree: int, iteration: int
     ) -> None:
         view = real_views(tube_sequence, tube_sequence.train)[0]
-        schedule = _schedule(8000, sh_every=1)
-        scene = _scene(degree)
+        schedule = step_schedule(8000, sh_every=1)
+        scene = shaken_scene(degree)
         density = density_strategy(schedule.densify, 20.0, 30, len(scene.gaussians), seed=0)
         steps = [NativeStep(scene, schedule), AutogradStep(scene, schedule)]
         for step in steps:
@@ -144,7 +110,7 @@ class TestOneStep:
             if value.numel():
                 moved, expected = own[name].detach() - start[name], value.detach() - start[name]
                 # A first Adam step is the sign of the gradient: a few that are nearly zero may differ.
-                assert _relative(moved, expected) < 0.02, name
+                assert relative_error(moved, expected) < 0.02, name
                 assert float(expected.abs().max()) > 0
         for name, value in steps[1].light.parameters().items():  # type: ignore[union-attr]
             rate = (
@@ -161,10 +127,10 @@ class TestOneStep:
 
     def test_depth_weight_zero_leaves_depth_alone(self, tube_sequence: EndoscopicSequence) -> None:
         view = real_views(tube_sequence, tube_sequence.train)[0]
-        schedule = _schedule(depth_weight=0.0)
+        schedule = step_schedule(depth_weight=0.0)
         density = density_strategy(schedule.densify, 20.0, 30, 900, seed=0)
         losses = [
-            NativeStep(_scene(), schedule).differentiate(v, 0, density).loss
+            NativeStep(shaken_scene(), schedule).differentiate(v, 0, density).loss
             for v in (view, replace(view, depth_mm=None))
         ]
         assert losses[0] == losses[1]
@@ -172,7 +138,7 @@ class TestOneStep:
 
 @pytest.mark.parametrize("lit", [True, False])
 def test_a_step_in_float64_is_that_in_float32(tube_sequence: EndoscopicSequence, lit: bool) -> None:
-    scene = _scene(lit=lit)
+    scene = shaken_scene(lit=lit)
     wide_gaussians, wide_light = (
         None
         if part is None
@@ -187,7 +153,7 @@ def test_a_step_in_float64_is_that_in_float32(tube_sequence: EndoscopicSequence,
         ssim_weight=ssim_weight,
         depth_confidence=0.5 * ssim_weight,
     )
-    schedule = _schedule()
+    schedule = step_schedule()
     density = density_strategy(schedule.densify, 20.0, 30, len(scene.gaussians), seed=0)
     found = []
     for start in (scene, wide):
@@ -199,8 +165,8 @@ def test_a_step_in_float64_is_that_in_float32(tube_sequence: EndoscopicSequence,
     assert expected_means.dtype == torch.float64
     assert loss == pytest.approx(expected_loss, rel=1e-5)
     # A few pixels end at another Gaussian.
-    assert _relative(torch.from_numpy(pose), torch.from_numpy(expected_pose)) < 1e-2
-    assert _relative(means, expected_means) < 1e-2
+    assert relative_error(torch.from_numpy(pose), torch.from_numpy(expected_pose)) < 1e-2
+    assert relative_error(means, expected_means) < 1e-2
 
 
 def _train(
@@ -208,8 +174,8 @@ def _train(
 ) -> tuple[Scene, list[dict[str, float]]]:
     views = real_views(sequence, sequence.train)
     mixed = [*views, _virtual(views[0])]
-    schedule = _schedule(iterations, densify=densify, sh_every=8)
-    result = optimise(_scene(), lambda i: mixed[i % len(mixed)], schedule, make_step=make_step)
+    schedule = step_schedule(iterations, densify=densify, sh_every=8)
+    result = optimise(shaken_scene(), lambda i: mixed[i % len(mixed)], schedule, make_step=make_step)
     return result.scene, result.history
 
 
@@ -255,27 +221,27 @@ class TestManySteps:
 
 class TestNativeStep:
     def test_the_scene_given_is_copied(self, tube_sequence: EndoscopicSequence) -> None:
-        scene = _scene()
+        scene = shaken_scene()
         before = scene.detached()
         view = real_views(tube_sequence, tube_sequence.train)[0]
-        optimise(scene, lambda _: view, _schedule(3), make_step=NativeStep)
+        optimise(scene, lambda _: view, step_schedule(3), make_step=NativeStep)
         for name, value in before.gaussians.parameters().items():
             assert torch.equal(scene.gaussians.parameters()[name], value), name
         for name, value in before.light.parameters().items():  # type: ignore[union-attr]
             assert torch.equal(scene.light.parameters()[name], value), name  # type: ignore[union-attr]
 
     def test_nonfinite_parameters_are_refused(self, tube_sequence: EndoscopicSequence) -> None:
-        scene = _scene()
+        scene = shaken_scene()
         scene.gaussians.shN[5, 1, 2] = float("inf")
         view = real_views(tube_sequence, tube_sequence.train)[0]
         with pytest.raises(NonFiniteError, match=r"sh\[5, 2, 2\] is inf"):
-            optimise(scene, lambda _: view, _schedule(2), make_step=NativeStep)
+            optimise(scene, lambda _: view, step_schedule(2), make_step=NativeStep)
 
     def test_chosen_where_it_can_work(self) -> None:
-        scene = _scene()
+        scene = shaken_scene()
         wide = Gaussians(**{k: v.double() for k, v in scene.gaussians.parameters().items()})
-        assert isinstance(training_step(scene, _schedule()), NativeStep)
-        assert isinstance(training_step(Scene(wide), _schedule()), AutogradStep)
+        assert isinstance(training_step(scene, step_schedule()), NativeStep)
+        assert isinstance(training_step(Scene(wide), step_schedule()), AutogradStep)
 
 
 @pytest.mark.parametrize("make_step", [NativeStep, AutogradStep])
@@ -292,7 +258,7 @@ def test_torch_threads_are_put_back(tube_sequence: EndoscopicSequence, make_step
 
     try:
         with pytest.raises(DivergedError, match="iteration 2"):
-            optimise(_scene(), draw, _schedule(5), make_step=make_step)
+            optimise(shaken_scene(), draw, step_schedule(5), make_step=make_step)
         assert torch.get_num_threads() == 2
         assert seen == [1, 1, 1]
     finally:
