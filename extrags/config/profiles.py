@@ -20,9 +20,9 @@ PROFILES: dict[str, PipelineConfig] = {
     "quick": PipelineConfig(
         coarse=CoarseConfig(
             iterations=1500,
-            max_points=8000,
+            max_points=24_000,
             sh_every=400,
-            densify=DensifyConfig(max_gaussians=14_000),
+            densify=DensifyConfig(max_gaussians=36_000),
             # The published learning rates are too small for a short run.
             optimiser=OptimiserConfig(means=3.2e-4, sh0=5e-3),
         ),
@@ -36,8 +36,8 @@ PROFILES: dict[str, PipelineConfig] = {
         ),
         explore=ExploreConfig(trajectories=12, length=10, rotation_deg=20.0, orbit_deg=20.0),
         enhance=EnhanceConfig(max_views=96),
-        # The low coarse limit leaves little detail for what is new: three times it costs seconds.
-        finetune=FinetuneConfig(iterations=1000, growth=3.0),
+        # Less room leaves little detail for what is new.
+        finetune=FinetuneConfig(iterations=1000, growth=1.75),
     ),
     # The default: minutes to a quarter of an hour on two cores.
     "balanced": PipelineConfig(
