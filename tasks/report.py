@@ -48,7 +48,7 @@ REPORT_PARTS: tuple[ReportPart, ...] = get_args(ReportPart)
 
 # `rows` holds the times of the stages in this run. The page shows them, but they are not part of its cache
 # key.
-@stage("report", version=14, ignore=("rows",))
+@stage("report", version=15, ignore=("rows",))
 def report(
     slot: Slot,
     parts: dict[str, Ref],
@@ -158,7 +158,7 @@ def _absent(skipped: dict[str, str]) -> dict[str, str]:
     }
 
 
-@stage("dataset-report", version=6, ignore=("rows",))
+@stage("dataset-report", version=7, ignore=("rows",))
 def dataset_report(
     slot: Slot,
     name: str,

@@ -10,7 +10,7 @@ import re
 import textwrap
 import threading
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -386,6 +386,7 @@ def methods_chart(
 def pairs_chart(
     panels: Sequence[tuple[str, bool]],
     rows: Sequence[tuple[str, Sequence[tuple[float, float | None, float | None] | None]]],
+    unjudged: Collection[tuple[int, int]] = (),
 ) -> Chart:
     """Paired differences with their 95 % intervals, one panel per figure, zero marked.
 
@@ -393,6 +394,7 @@ def pairs_chart(
         panels: title of each figure, and whether more is better.
         rows: name of each line, from the top, and by panel mean, low and high; None where there is no
             difference, no interval for a single pair.
+        unjudged: row and panel of differences of which neither sign is the better one.
     """
     from matplotlib.ticker import MaxNLocator
 
@@ -402,13 +404,13 @@ def pairs_chart(
         place = np.arange(len(rows))[::-1]
         for column, (panel, (title, higher_is_better)) in enumerate(zip(axes, panels, strict=True)):
             panel.axvline(0, color=QUIET, linewidth=0.8)
-            for at, (_, cells) in zip(place, rows, strict=True):
+            for line, (at, (_, cells)) in enumerate(zip(place, rows, strict=True)):
                 cell = cells[column]
                 if cell is None:
                     continue
                 mean, low, high = cell
                 color = FINAL_COLOR if (mean > 0) == higher_is_better else WORSE_COLOR
-                if mean == 0:
+                if mean == 0 or (line, column) in unjudged:
                     color = COARSE_COLOR
                 if low is not None and high is not None:
                     panel.hlines(at, low, high, color=color, linewidth=2.2, alpha=0.4)

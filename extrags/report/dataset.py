@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from statistics import fmean
 from typing import Any, Literal
@@ -106,8 +106,8 @@ def build_dataset_report(
         ],
         metrics=metrics,
         rows=[_table_row(row, metrics) for row in rows],
-        means=[_mean_cell(metric, _means_of_seeds(rows, metric, ())) for metric in metrics],
-        unobserved=[_mean_cell(metric, _means_of_seeds(rows, metric, ("unobserved",))) for metric in metrics],
+        means=[_mean_cell(metric, _by_sequence(rows).values(), ()) for metric in metrics],
+        unobserved=[_mean_cell(metric, _by_sequence(rows).values(), ("unobserved",)) for metric in metrics],
         compared=len(_means_of_seeds(rows, psnr, ())),
         seeds=_seed_rows(rows, metrics),
         chart=chart,
@@ -163,10 +163,19 @@ def _table_row(row: DatasetRow, metrics: Sequence[Metric]) -> dict[str, Any]:
         "seconds": duration(row.seconds),
         "note": " · ".join(part for part in (", ".join(said), gaussians) if part),
         "cells": [
-            compare(metric, metric_of(row.coarse, metric.key), metric_of(row.final, metric.key))
+            compare(
+                metric,
+                metric_of(row.coarse, metric.key),
+                metric_of(row.final, metric.key),
+                coverage=(_coverage(row.coarse, metric), _coverage(row.final, metric)),
+            )
             for metric in metrics
         ],
     }
+
+
+def _coverage(tree: Mapping[str, Any] | None, metric: Metric) -> float | None:
+    return metric_of(tree, metric.coverage) if metric.coverage else None
 
 
 def _both(row: DatasetRow, metric: Metric, path: tuple[str, ...]) -> tuple[float, float] | None:
@@ -190,17 +199,32 @@ def _means_of_seeds(
     rows: Sequence[DatasetRow], metric: Metric, path: tuple[str, ...]
 ) -> list[tuple[float, float]]:
     """A pair for each sequence, whatever its number of seeds."""
-    found = [_pairs(group, metric, path) for group in _by_sequence(rows).values()]
+    return _means(_by_sequence(rows).values(), metric, path)
+
+
+def _means(
+    groups: Iterable[Sequence[DatasetRow]], metric: Metric, path: tuple[str, ...]
+) -> list[tuple[float, float]]:
+    """The mean pair of each group that has one."""
+    found = [_pairs(group, metric, path) for group in groups]
     return [
         (fmean(first for first, _ in pairs), fmean(last for _, last in pairs)) for pairs in found if pairs
     ]
 
 
-def _mean_cell(metric: Metric, pairs: Sequence[tuple[float, float]]) -> dict[str, Any]:
+def _mean_cell(
+    metric: Metric, groups: Iterable[Sequence[DatasetRow]], path: tuple[str, ...]
+) -> dict[str, Any]:
+    """The mean over groups of rows, each of which counts once."""
+    having = [[row for row in group if _both(row, metric, path) is not None] for group in groups]
+    pairs = _means(having, metric, path)
     if not pairs:
         return {"comparison": compare(metric, None, None), "deviation": ""}
     coarse, final = np.array(pairs).T
-    comparison = compare(metric, float(coarse.mean()), float(final.mean()))
+    coverage: tuple[float | None, float | None] = (None, None)
+    if metric.coverage and (shares := _means(having, metric_named(metric.coverage), path)):
+        coverage = (fmean(first for first, _ in shares), fmean(last for _, last in shares))
+    comparison = compare(metric, float(coarse.mean()), float(final.mean()), coverage=coverage)
     return {"comparison": comparison, "deviation": _deviation(final - coarse, metric.digits)}
 
 
@@ -209,7 +233,7 @@ def _seed_rows(rows: Sequence[DatasetRow], metrics: Sequence[Metric]) -> list[di
         {
             "label": label,
             "seeds": len(group),
-            "cells": [_mean_cell(metric, _pairs(group, metric, ())) for metric in metrics],
+            "cells": [_mean_cell(metric, [[row] for row in group], ()) for metric in metrics],
         }
         for label, group in _by_sequence([row for row in rows if row.seed is not None]).items()
         if len(group) > 1

@@ -7,10 +7,17 @@ from typing import Any
 
 import numpy as np
 
-from extrags.metrics.registry import figures
+from extrags.metrics.registry import Metric, figures
 from extrags.report.downloads import Cell, csv_uri
 from extrags.report.inputs import ReportInputs
-from extrags.report.wording import compare, described_metrics, metric_of, number, shown_metrics
+from extrags.report.wording import (
+    compare,
+    described_metrics,
+    metric_of,
+    number,
+    shown_metrics,
+    with_coverages,
+)
 
 __all__ = [
     "REGIONS",
@@ -92,6 +99,7 @@ def tiles(inputs: ReportInputs) -> list[dict[str, Any]]:
                 metric_of(coarse, metric.key),
                 metric_of(final, metric.key),
                 _reason(inputs, metric.key),
+                _coverage(metric, coarse, final),
             ),
         }
         for metric in shown_metrics(coarse, final)
@@ -115,6 +123,7 @@ def regions(inputs: ReportInputs) -> list[dict[str, Any]]:
                     metric_of(coarse, *path, *alignment, metric.key),
                     metric_of(final, *path, *alignment, metric.key),
                     _reason(inputs, path[0] if path else metric.key),
+                    _coverage(metric, coarse, final, path),
                 )
                 for metric in shown_metrics(coarse, final)
             ]
@@ -127,6 +136,18 @@ def regions(inputs: ReportInputs) -> list[dict[str, Any]]:
                 }
             )
     return rows
+
+
+def _coverage(
+    metric: Metric,
+    coarse: Mapping[str, Any] | None,
+    final: Mapping[str, Any] | None,
+    path: tuple[str, ...] = (),
+) -> tuple[float | None, float | None]:
+    """Share of the pixels that a metric is over in both scenes; None for all of them."""
+    if not metric.coverage:
+        return None, None
+    return metric_of(coarse, *path, metric.coverage), metric_of(final, *path, metric.coverage)
 
 
 def missing_reasons(inputs: ReportInputs) -> list[tuple[str, str]]:
@@ -190,7 +211,7 @@ def numbers_csv(inputs: ReportInputs) -> str:
     rows: list[list[Cell]] = []
     for path, label in REGIONS:
         for alignment, kind in (((), "plain"), (("aligned",), "exposure-aligned")):
-            for metric in shown_metrics(coarse, final):
+            for metric in with_coverages(shown_metrics(coarse, final)):
                 values = [metric_of(tree, *path, *alignment, metric.key) for tree in trees.values()]
                 if any(value is not None for value in values):
                     better = "higher" if metric.higher_is_better else "lower"

@@ -339,3 +339,18 @@ def test_intrinsics_that_nobody_stated_are_told(
     assert said in told
     assert ("degrees), not determined" in told) == (intrinsics == "guessed")
     assert "Focal length" not in html
+
+
+def test_coverage_of_the_depth_stands_beside_its_error(inputs: ReportInputs) -> None:
+    def told(result: dict[str, object], error: float, coverage: float) -> dict[str, object]:
+        depth = {"depth_absrel": error, "depth_coverage": coverage}
+        return {**result, "metrics": {**result["metrics"], **depth}}  # type: ignore[dict-item]
+
+    fuller = replace(
+        inputs,
+        coarse_metrics=told(result_of(20.0, 1000), 0.03, 0.49),
+        final_metrics=told(result_of(22.5, 1500), 0.05, 1.0),
+    )
+    text = Page(build_report(fuller, CONFIG)).text
+    assert "+0.020 from 0.030 over more pixels: coverage 49 % → 100 %" in text
+    assert "+0.020 worse" not in text
