@@ -127,7 +127,11 @@ def build_benchmark_report(inputs: BenchmarkInputs) -> str:
             )
             for pair in inputs.pictures
         ],
-        protocol={"version": None, "metrics": described_metrics(*(run["metrics"] for run in measured))},
+        protocol={
+            "version": None,
+            "metrics": described_metrics(*(run["metrics"] for run in measured)),
+            "surface": any(column.name.startswith("surface.") for column in columns),
+        },
     )
 
 

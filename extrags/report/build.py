@@ -21,6 +21,7 @@ from extrags.report.numbers import (
     protocol,
     regions,
     summary,
+    surface_rows,
     tiles,
     unobserved_shares,
 )
@@ -78,6 +79,7 @@ def build_pages(inputs: ReportInputs, config: ReportConfig) -> tuple[str, str]:
         summary=summary(inputs),
         tiles=tiles(inputs),
         regions=regions(inputs),
+        surface=surface_rows(inputs),
         missing_reasons=missing_reasons(inputs),
         numbers_csv=numbers_csv(inputs),
         per_view_csv=per_view_csv(inputs),

@@ -111,7 +111,7 @@ def build_dataset_report(
         compared=len(_means_of_seeds(rows, psnr, ())),
         seeds=_seed_rows(rows, metrics),
         chart=chart,
-        protocol={"version": None, "metrics": described_metrics(*trees)},
+        protocol={"version": None, "metrics": described_metrics(*trees), "surface": False},
     )
 
 

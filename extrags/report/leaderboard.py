@@ -105,7 +105,7 @@ def build_leaderboard(rows: Sequence[BoardRow], *, name: str = "Leaderboard") ->
         ],
         rows=[_run(row, shown) for row in rows],
         csv=_csv(rows, shown),
-        protocol={"version": None, "metrics": described_metrics(*trees)},
+        protocol={"version": None, "metrics": described_metrics(*trees), "surface": False},
     )
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from extrags.metrics.registry import Metric, figures
+from extrags.metrics.registry import Metric, figures, metrics
 from extrags.report.downloads import Cell, csv_uri
 from extrags.report.inputs import ReportInputs
 from extrags.report.wording import (
@@ -29,6 +29,7 @@ __all__ = [
     "protocol",
     "regions",
     "summary",
+    "surface_rows",
     "tiles",
     "unobserved_shares",
 ]
@@ -39,6 +40,12 @@ REGIONS = (
     (("unobserved",), "Never observed"),
 )
 """Kinds of pixels: where their figures stand in a tree of metrics, and what they are called."""
+SURFACE_PARTS = (
+    (("surface",), "Observed by training"),
+    (("surface", "unobserved"), "Never observed"),
+    (("surface",), "All that a camera sees"),
+)
+"""Parts of the true surface, the same way; the coverage alone is of all of it."""
 _GROUP_LABELS = {
     "observed": "Observed pixels",
     "unobserved": "Unobserved pixels",
@@ -138,6 +145,34 @@ def regions(inputs: ReportInputs) -> list[dict[str, Any]]:
     return rows
 
 
+def surface_rows(inputs: ReportInputs) -> dict[str, Any] | None:
+    """The table of the surface, `{metrics, unit, rows}`; None where neither scene has figures of it."""
+    coarse, final = metrics_of(inputs.coarse_metrics), metrics_of(inputs.final_metrics)
+    if not _has_surface(coarse, final):
+        return None
+    shown = [metric for metric in metrics("surface") if metric.shown.get("columns")]
+    rows = []
+    for path, label in SURFACE_PARTS:
+        of_all = label == SURFACE_PARTS[-1][1]
+        cells = [
+            compare(metric, metric_of(coarse, *path, metric.key), metric_of(final, *path, metric.key))
+            if (metric.key == "coverage") == of_all
+            else None
+            for metric in shown
+        ]
+        rows.append({"label": label, "cells": cells})
+    return {"metrics": shown, "unit": "mm" if inputs.sequence.metric else "units", "rows": rows}
+
+
+def _has_surface(*trees: Mapping[str, Any] | None) -> bool:
+    return any(
+        metric_of(tree, *path, metric.key) is not None
+        for tree in trees
+        for path, _ in SURFACE_PARTS
+        for metric in metrics("surface")
+    )
+
+
 def _coverage(
     metric: Metric,
     coarse: Mapping[str, Any] | None,
@@ -151,11 +186,14 @@ def _coverage(
 
 
 def missing_reasons(inputs: ReportInputs) -> list[tuple[str, str]]:
-    """Which figures there are not, and why."""
+    """Which figures the page has no value for, and why; of the surface only where there is a table of it."""
+    no_surface = not _has_surface(metrics_of(inputs.coarse_metrics), metrics_of(inputs.final_metrics))
     labels = {figure.name: figure.label for figure in figures()} | _GROUP_LABELS
     found: dict[str, str] = {}
     for result in (inputs.coarse_metrics, inputs.final_metrics):
         for key, reason in (result or {}).get("reasons", {}).items():
+            if no_surface and key.partition(".")[0] == "surface":
+                continue
             found.setdefault(labels.get(key, key), str(reason))
     return sorted(found.items())
 
@@ -164,7 +202,11 @@ def protocol(inputs: ReportInputs) -> dict[str, Any]:
     """Version of the protocol, and what its metrics are."""
     result = inputs.final_metrics or inputs.coarse_metrics or {}
     trees = (metrics_of(inputs.coarse_metrics), metrics_of(inputs.final_metrics))
-    return {"version": result.get("protocol"), "metrics": described_metrics(*trees)}
+    return {
+        "version": result.get("protocol"),
+        "metrics": described_metrics(*trees),
+        "surface": _has_surface(*trees),
+    }
 
 
 def _reason(inputs: ReportInputs, key: str) -> str:

@@ -114,7 +114,11 @@ def build_run_comparison(sequence: EndoscopicSequence, runs: Sequence[ComparedRu
         not_pictured=[run.name for run in runs[MOST_PICTURED:]],
         differing=differing,
         same=len(set().union(*(run.settings for run in runs))) - len(differing),
-        protocol={"version": runs[0].result.get("protocol"), "metrics": described_metrics(*trees)},
+        protocol={
+            "version": runs[0].result.get("protocol"),
+            "metrics": described_metrics(*trees),
+            "surface": False,
+        },
         protocols=sorted({str(run.result.get("protocol")) for run in runs}),
         compare_script=script_text("compare.js"),
     )

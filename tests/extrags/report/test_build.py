@@ -180,15 +180,45 @@ def test_what_there_is_not_is_called_what_it_is(inputs: ReportInputs) -> None:
     result = result_of(20.0, 10)
     result["reasons"] = {
         "n_gaussians": "the renders are not of Gaussians",
-        "surface": "the sequence has no true depth",
-        "surface.accuracy_mm": "the scene has no surface",
         "unobserved": "no view has any",
     }
     text = Page(build_report(replace(inputs, coarse_metrics=result, final_metrics=result), CONFIG)).text
     assert "Number of Gaussians: not available, the renders are not of Gaussians." in text
-    assert "Figures of the surface: not available, the sequence has no true depth." in text
-    assert "Surface accuracy: not available, the scene has no surface." in text
     assert "Unobserved pixels: not available, no view has any." in text
+
+
+def test_the_surface_has_a_table_where_there_are_figures_of_it(inputs: ReportInputs) -> None:
+    def told(psnr: float, accuracy_mm: float | None, coverage: float) -> dict[str, object]:
+        result = result_of(psnr, 1000)
+        unobserved = {"accuracy_mm": 4.0, "completeness_mm": None, "fscore": 0.1}
+        result["metrics"]["surface"] = {
+            "accuracy_mm": accuracy_mm,
+            "completeness_mm": 0.8,
+            "fscore": 0.7,
+            "coverage": coverage,
+            "unobserved": unobserved,
+        }
+        return result
+
+    both = replace(inputs, coarse_metrics=told(20.0, 0.9, 0.6), final_metrics=told(22.0, 0.7, 0.65))
+    text = Page(build_report(both, CONFIG)).text
+    assert "Observed by training 0.90 → 0.70 −0.20 better 0.80 → 0.80 ±0.00" in text  # noqa: RUF001
+    assert "All that a camera sees 0.600 → 0.650 +0.050 better" in text
+    assert "fused into a mesh in the same way for every method" in text
+
+    lacking = told(22.0, None, 0.65)
+    lacking["reasons"] = {"surface.accuracy_mm": "the scene has no surface"}
+    text = Page(build_report(replace(both, final_metrics=lacking), CONFIG)).text
+    assert "Surface accuracy: not available, the scene has no surface." in text
+
+
+def test_a_page_without_figures_of_the_surface_does_not_speak_of_it(inputs: ReportInputs) -> None:
+    result = result_of(20.0, 10)
+    result["reasons"] = {"surface": "the sequence has no true depth"}
+    text = Page(build_report(replace(inputs, coarse_metrics=result, final_metrics=result), CONFIG)).text
+    assert "The surface" not in text
+    assert "no true depth" not in text
+    assert "fused into a mesh" not in text
 
 
 def test_a_metric_of_colours_is_aligned_whatever_it_is_called(inputs: ReportInputs) -> None:
