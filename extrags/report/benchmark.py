@@ -12,6 +12,7 @@ from extrags.report.charts import method_colors, methods_chart, pairs_chart
 from extrags.report.comparison import RenderedMethod, compared_rows
 from extrags.report.downloads import Chart
 from extrags.report.page import rendered_page
+from extrags.report.run_facts import given_settings, seconds_of_all, shared_facts
 from extrags.report.trend import trend_chart
 from extrags.report.wording import count, described_metrics, duration, number, percent, same_pixels
 from extrags.sequence import EndoscopicSequence
@@ -48,8 +49,10 @@ class BenchmarkInputs:
 
     Args:
         name: title.
-        runs: `{method, profile, sequence, setting, seed, seconds, peak_mib, metrics, error}` of each;
-            `metrics` is None for a failed run, whose `error` says why.
+        runs: `{method, profile, sequence, setting, seed, settings, image_size, seconds, stages, peak_mib,
+            metrics, error}` of each; `metrics` is None for a failed run, whose `error` says why. `settings`
+            were given beside the profile, `image_size` is width and height in px, and of `stages`
+            `{artefacts, made_seconds}` tell what runs share; these three may be missing.
         baseline: method the others are compared with.
         methods: what each method is, in words, in the order they are shown.
         pictures: held-out views side by side.
@@ -86,6 +89,7 @@ def build_benchmark_report(inputs: BenchmarkInputs) -> str:
         for column in figures("columns")
         if any(figure_of(run["metrics"], column.name) is not None for run in measured)
     ]
+    settings = [run.get("settings", {}) for run in inputs.runs]
     images = sum(5 * min(inputs.views, len(pair.sequence.test)) for pair in inputs.pictures)
     largest = LARGEST_PAGE_BYTES // max(images, 1)
     return rendered_page(
@@ -98,8 +102,13 @@ def build_benchmark_report(inputs: BenchmarkInputs) -> str:
             ("Runs", count(len(inputs.runs))),
             ("Sequences", count(len({(run["sequence"], run["setting"]) for run in inputs.runs}))),
             ("Seeds", count(len({run["seed"] for run in inputs.runs}))),
-            ("Run time of all", duration(sum(run["seconds"] for run in inputs.runs))),
+            (
+                "Run time of all",
+                duration(seconds_of_all((run["seconds"], run.get("stages", ())) for run in inputs.runs)),
+            ),
+            *shared_facts([run.get("image_size") for run in inputs.runs], settings),
         ],
+        given=given_settings([_label(run) for run in inputs.runs], settings),
         methods=inputs.methods,
         failures=[
             (f"{_label(run)}, {run['method']}, seed {run['seed']}", run["error"] or "no reason was recorded")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from statistics import fmean
 from typing import Any, Literal
 
@@ -13,6 +13,7 @@ import numpy as np
 from extrags.metrics.registry import Metric, metric_named
 from extrags.report.charts import sequences_chart
 from extrags.report.page import rendered_page
+from extrags.report.run_facts import given_settings, seconds_of_all, shared_facts
 from extrags.report.wording import (
     compare,
     count,
@@ -42,6 +43,8 @@ class DatasetRow:
         seed: of the run, when there are several of the same sequence and variant.
         variant: what else sets it apart from other runs of the same sequence, in words.
         link: relative address of the sequence's own page; no link when empty.
+        settings: that were given beside the profile, by dotted name.
+        image_size: width and height in px; None where it is not known.
     """
 
     name: str
@@ -54,6 +57,8 @@ class DatasetRow:
     seed: int | None = None
     variant: str = ""
     link: str = ""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    image_size: Sequence[int] | None = None
 
     @property
     def label(self) -> str:
@@ -99,8 +104,10 @@ def build_dataset_report(
             *([("Runs", count(len(rows)))] if _kind(rows) == "runs" else []),
             ("Completed", count(sum(row.status == "completed" for row in rows))),
             ("Failed", count(sum(row.status == "failed" for row in rows))),
-            ("Time to make all", duration(_seconds_of_all(rows))),
+            ("Time to make all", duration(seconds_of_all((row.seconds, row.stages) for row in rows))),
+            *shared_facts([row.image_size for row in rows], [row.settings for row in rows]),
         ],
+        given=given_settings([row.name for row in rows], [row.settings for row in rows]),
         failures=[
             (row.label, row.error or "no reason was recorded") for row in rows if row.status == "failed"
         ],
@@ -128,18 +135,6 @@ def _summary(rows: Sequence[DatasetRow]) -> str:
         f"{text} Over the {len(pairs)} with a coarse and a final scene, PSNR on held-out views changes by "
         f"{number(change, 2, signed=True)} dB on average; {better} of {len(pairs)} gain."
     )
-
-
-def _seconds_of_all(rows: Sequence[DatasetRow]) -> float:
-    """A stage that several rows share counts once."""
-    shared: dict[tuple[str, ...], float] = {}
-    alone = 0.0
-    for row in rows:
-        told = {tuple(stage.get("artefacts", ())): stage.get("made_seconds", 0.0) for stage in row.stages}
-        told.pop((), None)
-        shared |= told
-        alone += max(0.0, row.seconds - sum(told.values()))
-    return sum(shared.values()) + alone
 
 
 def _kind(rows: Sequence[DatasetRow]) -> Literal["sequences", "runs"]:

@@ -199,6 +199,12 @@ def test_colours_of_methods() -> None:
     assert len(set(colors.values())) == 3
 
 
+def test_stages_that_runs_share_took_their_time_once(inputs: BenchmarkInputs) -> None:
+    stages = [{"artefacts": ["ingest-0"], "made_seconds": 20.0}, {"artefacts": [], "made_seconds": 0.0}]
+    runs = [{**run, "seconds": 50.0, "stages": stages} for run in inputs.runs[:2]]
+    assert "Run time of all 1 min 20 s" in Page(build_benchmark_report(replace(inputs, runs=runs))).text
+
+
 def test_depth_over_different_pixels_is_not_judged() -> None:
     def page_of(coverage: float) -> Page:
         runs = runs_of({"phantom/0": 1.0}, seeds=2)
