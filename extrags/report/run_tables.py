@@ -10,6 +10,7 @@ from pydantic import BaseModel
 
 from extrags.config import PipelineConfig
 from extrags.report.inputs import ReportInputs
+from extrags.report.measurements import measured_figure, measurement_rows
 from extrags.report.numbers import metrics_of
 from extrags.report.wording import count, duration, intrinsics_in_words, metric_of
 
@@ -58,15 +59,13 @@ def plan_rows(inputs: ReportInputs) -> dict[str, Any] | None:
     if inputs.plan is None:
         return None
     return {
-        "measurements": [
-            (name.replace("_", " "), _figure(value)) for name, value in inputs.plan["measurements"].items()
-        ],
+        "measurements": measurement_rows(inputs.plan["measurements"], metric=inputs.sequence.metric),
         "decisions": [
             {
                 "stage": line["stage"],
                 "run": line["run"],
-                "value": _figure(line["value"]),
-                "threshold": _figure(line["threshold"]),
+                "value": measured_figure(line["value"]),
+                "threshold": measured_figure(line["threshold"]),
                 "budget": [f"{key} = {value}" for key, value in line["budget"].items()],
                 "saves": "" if line.get("saves_s") is None else f"{line['saves_s']:.1f} s",
                 "reason": line["reason"],
@@ -162,11 +161,6 @@ def flat_settings(model: BaseModel, prefix: str = "") -> dict[str, Any]:
         else:
             found[prefix + name] = value
     return found
-
-
-def _figure(value: float | int) -> str:
-    """A measured number: whole ones as counts, others with four digits."""
-    return count(value) if float(value).is_integer() else f"{float(value):.4g}"
 
 
 def plain_value(value: Any) -> str:

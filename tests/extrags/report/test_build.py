@@ -146,6 +146,17 @@ def test_what_the_plan_left_out_is_named_with_its_reason(inputs: ReportInputs) -
     assert not any("final render" in str(image["alt"]) for image in page.images)
 
 
+def test_measurements_of_the_plan_have_words_and_units(inputs: ReportInputs) -> None:
+    measured = {"hole_share": 0.124, "gaussians": 14012.0, "depth_unit_mm": 1.688, "further_one": 0.5}
+    plan = {**inputs.plan, "measurements": measured}
+    text = Page(build_report(replace(inputs, plan=plan), CONFIG)).text
+    assert "Holes in nearby views 12.4 %" in text
+    assert "Median depth of the training views 1.688 mm" in text
+    assert "further one 0.5" in text
+    scaleless = replace(inputs, plan=plan, sequence=replace(inputs.sequence, metric=False))
+    assert "training views 1.688 units of the scene" in Page(build_report(scaleless, CONFIG)).text
+
+
 def test_bare_inputs_name_every_absent_part(inputs: ReportInputs) -> None:
     page = Page(build_report(ReportInputs(name="bare", sequence=inputs.sequence), CONFIG))
     for stage in ("evaluate", "enhance", "explore", "freespace", "surface", "coarse", "assess"):
