@@ -78,7 +78,7 @@ class ImageTable:
     outlined: bool = False
     """Whether unseen surface is outlined somewhere."""
     masked: bool = False
-    """Whether pixels outside a mask are greyed out somewhere."""
+    """Whether pixels outside a mask, or without depth, are greyed out somewhere."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -120,11 +120,17 @@ def test_how_the_restorer_was_judged_is_told(inputs: ReportInputs, html: str) ->
     assert inputs.pseudo is not None
     judged = {"restored_db": 20.0, "filled_db": 26.0, "error_over_expected": 2.5}
     for provenance, words in (
-        ({"backend": "classical", "judged": judged}, "is unlike those it has learned from"),
+        ({"backend": "embedded", "judged": judged}, "is unlike those it has learned from"),
+        (
+            {"backend": "classical", "judged": judged},
+            "The network was left out: on left-out frames of this scene it reaches 20.00 dB, 6.00 dB less",
+        ),
         ({"backend": "classical"}, "Restored by classical."),
     ):
         pseudo = replace(inputs.pseudo, provenance=provenance)
-        assert words in build_report(replace(inputs, pseudo=pseudo), ReportConfig())
+        html = build_report(replace(inputs, pseudo=pseudo), ReportConfig())
+        assert words in html
+        assert ("it has learned from" in html) == (provenance["backend"] == "embedded")
 
 
 def test_what_the_plan_left_out_is_named_with_its_reason(inputs: ReportInputs) -> None:
@@ -260,6 +266,40 @@ def test_frames_that_left_for_want_of_a_pose_are_told(inputs: ReportInputs, page
     assert "the 3 without a pose are not among them" in told.text
     assert f"Training frames {len(inputs.sequence.train)} Held-out" in told.text
     assert "without a pose" not in page.text
+
+
+def test_counts_of_virtual_views_agree(inputs: ReportInputs, page: Page) -> None:
+    # Two trajectories of seven poses, of which the first is a real one.
+    assert "Virtual views 12 Coverage before" in page.text
+    assert "b_000 6 " in page.text
+    assert "b_003 6 " in page.text
+    assert "enhance.max_views" not in page.text
+    more = {**inputs.exploration, "virtual_views": 14}
+    text = Page(build_report(replace(inputs, exploration=more), CONFIG)).text
+    assert "The exploration found 14 views; 12 of them were restored" in text
+
+
+def test_charts_say_what_they_draw(inputs: ReportInputs, page: Page) -> None:
+    def said(page: Page) -> str:
+        return next(str(image["alt"]) for image in page.images if "PSNR of every" in str(image["alt"]))
+
+    scenes = "PSNR of every held-out view in the coarse and the final scene"
+    assert said(page) == f"{scenes}, and the gain against the share of pixels that training never saw"
+    alone = replace(inputs, final=None, final_metrics=None)
+    assert said(Page(build_report(alone, CONFIG))) == "PSNR of every held-out view in the coarse scene"
+    views = [{**view, "unobserved": {}} for view in inputs.coarse_metrics["per_view"]]
+    blind = {**inputs.coarse_metrics, "per_view": views}
+    told = build_report(replace(inputs, coarse_metrics=blind, final_metrics=blind), CONFIG)
+    assert said(Page(told)) == scenes
+
+
+def test_holes_of_the_depth_are_explained(inputs: ReportInputs, page: Page) -> None:
+    explained = "Light grey is where a scene has a hole"
+    assert explained not in page.text
+    alpha = inputs.coarse.alpha.copy()
+    alpha[:, :5] = 0
+    holes = replace(inputs.coarse, alpha=alpha)
+    assert explained in Page(build_report(replace(inputs, coarse=holes), CONFIG)).text
 
 
 def test_names_are_escaped(inputs: ReportInputs) -> None:
