@@ -26,7 +26,14 @@ from extrags.report.numbers import (
     unobserved_shares,
 )
 from extrags.report.page import rendered_page
-from extrags.report.run_tables import facts, plan_rows, setting_groups, stage_rows, stage_summary
+from extrags.report.run_tables import (
+    facts,
+    plan_rows,
+    setting_groups,
+    stage_rows,
+    stage_summary,
+    usual_settings,
+)
 from extrags.report.space import occupancy_slices, scene_views, trajectory_colors
 from extrags.report.viewer.content import viewer_section
 from extrags.report.views import depth_rows, held_out_rows, virtual_rows
@@ -93,7 +100,8 @@ def build_pages(inputs: ReportInputs, config: ReportConfig) -> tuple[str, str]:
         without_pose=inputs.without_pose[1],
         stages_absent="No stage times were handed to this report.",
         protocol=protocol(inputs),
-        settings=setting_groups(inputs.config),
+        settings=setting_groups(inputs.config, inputs.profile),
+        usual=usual_settings(inputs.profile)[0],
     )
     pages = [
         rendered_page(

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from extrags.config import ReportConfig
+from extrags.config import ReportConfig, profile_config
 from extrags.errors import NonFiniteError, ShapeError
 from extrags.metrics.registry import Metric, register_metric, unregister_metric
 from extrags.report import ReportInputs, build_report
@@ -84,8 +84,27 @@ def test_numbers_and_changes_are_on_the_page(page: Page) -> None:
     assert "1 min 05 s in all: 1 ran, 1 came from the cache, 1 skipped." in page.text
     assert "The cache spared 5.0 s" in page.text
     assert "the source has poses" in page.text
-    assert "iterations 777 default 3000" in page.text
+    assert "iterations 777 profile quick: 1500" in page.text
     assert "on the network AlexNet" in page.text
+
+
+@pytest.mark.parametrize(
+    ("profile", "differs"),
+    [
+        ("quick", None),
+        ("quick, method 3dgs", None),
+        ("balanced", "profile balanced: 5000"),
+        ("", "default: 3000"),
+        ("mine", "default: 3000"),
+    ],
+)
+def test_settings_are_held_against_the_profile_of_the_run(
+    inputs: ReportInputs, profile: str, differs: str | None
+) -> None:
+    quick = replace(inputs, config=profile_config("quick"), profile=profile)
+    text = Page(build_report(quick, CONFIG)).text.split("Settings and environment")[1]
+    assert ("profile quick:" in text or "default:" in text or "profile balanced:" in text) == bool(differs)
+    assert differs is None or f"iterations 1500 {differs}" in text
 
 
 def test_a_loss_is_called_a_loss(inputs: ReportInputs) -> None:
