@@ -42,10 +42,9 @@ def measurement_rows(measurements: Mapping[str, float], *, metric: bool) -> list
     rows = []
     for name, value in measurements.items():
         label, kind = _LABELS.get(name, (name.replace("_", " "), "number"))
-        text = measured_figure(100 * value if kind == "share" else value)
-        if kind == "length":
-            text += " mm" if metric else " units of the scene"
-        rows.append((label, text + {"share": " %", "pixels": " px"}.get(kind, "")))
+        unit = {"share": " %", "pixels": " px", "length": " mm" if metric else " units of the scene"}
+        figure = f"{100 * value:.2f}" if kind == "share" else measured_figure(value)
+        rows.append((label, figure + unit.get(kind, "")))
     return rows
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,10 +12,12 @@ from extrags.metrics.registry import Metric, figures, metrics
 from extrags.report.downloads import Cell, csv_uri
 from extrags.report.inputs import ReportInputs
 from extrags.report.wording import (
+    Comparison,
     compare,
     described_metrics,
     metric_of,
     number,
+    same_pixels,
     shown_metrics,
     with_coverages,
 )
@@ -155,13 +158,23 @@ def surface_rows(inputs: ReportInputs) -> dict[str, Any] | None:
     for path, label in SURFACE_PARTS:
         of_all = label == SURFACE_PARTS[-1][1]
         cells = [
-            compare(metric, metric_of(coarse, *path, metric.key), metric_of(final, *path, metric.key))
-            if (metric.key == "coverage") == of_all
-            else None
+            _surface_comparison(metric, coarse, final, path) if (metric.key == "coverage") == of_all else None
             for metric in shown
         ]
         rows.append({"label": label, "cells": cells})
     return {"metrics": shown, "unit": "mm" if inputs.sequence.metric else "units", "rows": rows}
+
+
+def _surface_comparison(
+    metric: Metric, coarse: Mapping[str, Any] | None, final: Mapping[str, Any] | None, path: tuple[str, ...]
+) -> Comparison:
+    """A figure of the surface; accuracy is judged only where about as much of the true one was found."""
+    found = compare(metric, metric_of(coarse, *path, metric.key), metric_of(final, *path, metric.key))
+    before, after = (metric_of(tree, *path, "recall") for tree in (coarse, final))
+    if metric.key != "accuracy_mm" or before is None or after is None or same_pixels(before, after):
+        return found
+    said = f"over {'more' if after > before else 'less'} of the surface"
+    return replace(found, verdict="other pixels", coverage=said)
 
 
 def _has_surface(*trees: Mapping[str, Any] | None) -> bool:

@@ -175,7 +175,7 @@ def test_measurements_of_the_plan_have_words_and_units(inputs: ReportInputs) -> 
     measured = {"hole_share": 0.124, "gaussians": 14012.0, "depth_unit_mm": 1.688, "further_one": 0.5}
     plan = {**inputs.plan, "measurements": measured}
     text = Page(build_report(replace(inputs, plan=plan), CONFIG)).text
-    assert "Holes in nearby views 12.4 %" in text
+    assert "Holes in nearby views 12.40 %" in text
     assert "Median depth of the training views 1.688 mm" in text
     assert "further one 0.5" in text
     scaleless = replace(inputs, plan=plan, sequence=replace(inputs.sequence, metric=False))
@@ -226,7 +226,7 @@ def test_what_there_is_not_is_called_what_it_is(inputs: ReportInputs) -> None:
 def test_the_surface_has_a_table_where_there_are_figures_of_it(inputs: ReportInputs) -> None:
     def told(psnr: float, accuracy_mm: float | None, coverage: float) -> dict[str, object]:
         result = result_of(psnr, 1000)
-        unobserved = {"accuracy_mm": 4.0, "completeness_mm": None, "fscore": 0.1}
+        unobserved = {"accuracy_mm": psnr, "completeness_mm": None, "fscore": 0.1, "recall": coverage}
         result["metrics"]["surface"] = {
             "accuracy_mm": accuracy_mm,
             "completeness_mm": 0.8,
@@ -239,6 +239,8 @@ def test_the_surface_has_a_table_where_there_are_figures_of_it(inputs: ReportInp
     both = replace(inputs, coarse_metrics=told(20.0, 0.9, 0.6), final_metrics=told(22.0, 0.7, 0.65))
     text = Page(build_report(both, CONFIG)).text
     assert "Observed by training 0.90 → 0.70 −0.20 better 0.80 → 0.80 ±0.00" in text  # noqa: RUF001
+    # Where there was next to no surface, what there was lay near the true one.
+    assert "Never observed 20.00 → 22.00 +2.00 over more of the surface" in text
     assert "All that a camera sees 0.600 → 0.650 +0.050 better" in text
     assert "fused into a mesh in the same way for every method" in text
 
