@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-__all__ = ["SCALE_WORDS", "IntrinsicsSource", "PoseSource", "ScaleSource"]
+__all__ = ["ARBITRARY_SCALE", "SCALE_WORDS", "IntrinsicsSource", "PoseSource", "ScaleSource"]
 
 PoseSource = Literal["given", "estimated", "aligned", "refined"]
 """Origin of the poses. given: by the source; estimated: by COLMAP; aligned: by RGB-D alignment; refined:
@@ -25,3 +25,5 @@ SCALE_WORDS: dict[ScaleSource, str] = {
     "working_distance": "millimetres from the working distance given",
 }
 """What lengths of a metric sequence are, and what says so."""
+ARBITRARY_SCALE = "arbitrary scale"
+"""What they are of any other."""

@@ -15,7 +15,7 @@ from extrags.cameras import Cameras
 from extrags.errors import ShapeError
 from extrags.frame_stacks import frames_of, stacked
 from extrags.lens import Undistortion, resized_depth
-from extrags.provenance import SCALE_WORDS, IntrinsicsSource, PoseSource, ScaleSource
+from extrags.provenance import ARBITRARY_SCALE, SCALE_WORDS, IntrinsicsSource, PoseSource, ScaleSource
 from extrags.radial_lens import VIRTUAL_FIELD_DEG, RadialLens
 from extrags.splits import Split
 from extrags.store.storable import Storable
@@ -205,7 +205,7 @@ class EndoscopicSequence(Storable):
     @property
     def scale_words(self) -> str:
         """What lengths are, and what says so, for tables and reports."""
-        return SCALE_WORDS[self.scale_source] if self.metric else "arbitrary scale"
+        return SCALE_WORDS[self.scale_source] if self.metric else ARBITRARY_SCALE
 
     def in_millimetres(self, mm_per_unit: float, source: ScaleSource) -> EndoscopicSequence:
         """A copy of a posed sequence with all lengths multiplied, which makes it metric.

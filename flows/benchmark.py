@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from itertools import product
 from typing import Annotated, Any
 
@@ -15,6 +15,7 @@ from pydantic import Field
 from extrags.config import ProfileName, Seed
 from extrags.errors import ConfigError
 from extrags.pipeline import HELD_OUT_TRAINED_ON
+from extrags.redaction import without_credentials_in
 from extrags.store import Store, digest_of
 from flows.damage import again_after_damage
 from flows.history import (
@@ -31,7 +32,7 @@ from flows.leases import run_lease
 from flows.limits import DEFAULT_LIMITS, StageLimits
 from flows.methods import METHODS, MethodName, method_config
 from flows.outcome import NOT_COUNTED, SequenceOutcome
-from flows.pages import benchmark_page
+from flows.pages import benchmark_page, image_size
 from flows.parameters import Sequences, Settings, StoreRoot, Variants
 from flows.preflight import preflight
 from flows.run_page import run_page
@@ -63,6 +64,10 @@ class Case:
     """Digest of the method and settings that were asked for, without profile, seed and defaults."""
     settings: str = ""
     """Digest of all settings but the seed."""
+    given: dict[str, Any] = field(default_factory=dict)
+    """Settings that were given for its sequence beside the profile; not what a variant changes."""
+    image_size: tuple[int, int] | None = None
+    """Width and height in px; None where nothing was read."""
 
 
 @flow(name="benchmark", flow_run_name="{name}", log_prints=False, persist_result=False)
@@ -112,8 +117,8 @@ def benchmark(
     shows as a trend. A run that fails does not stop the others.
 
     Returns:
-        `{machine, cases: [{method, profile, sequence, setting, seed, seconds, spent_seconds,
-        processor_seconds, peak_mib, metrics, ...}],
+        `{machine, methods: {NAME: WORDS}, cases: [{method, profile, sequence, setting, seed, settings,
+        image_size, seconds, spent_seconds, processor_seconds, peak_mib, metrics, ...}],
         comparison, regressions, not_judged, report}`; `metrics` is None for a failed run, whose `error`
         says why. `regressions` and `not_judged` are those of `flows.history.Judgement`, in words.
         `comparison` is
@@ -199,6 +204,7 @@ def benchmark(
 
     result = {
         "machine": about,
+        "methods": words,
         "cases": cases,
         "comparison": compare_runs(cases, baseline),
         **asdict(judgement),
@@ -287,7 +293,10 @@ def run_method(
         memory_limit_gb=memory_limit_gb,
     )
     # Seeds are repetitions of the same: their means are compared over time.
-    return Case(method, profile, seed, outcome, asked, digest_of(config.with_seed(0)))
+    size = image_size(outcome, Store(store)) if outcome.refs else None
+    return Case(
+        method, profile, seed, outcome, asked, digest_of(config.with_seed(0)), dict(settings or {}), size
+    )
 
 
 def case_of(case: Case) -> dict[str, Any]:
@@ -296,7 +305,8 @@ def case_of(case: Case) -> dict[str, Any]:
     `seconds` is what its stages took when they were made, without evaluation and report, `processor_seconds`
     the processor time of all threads meanwhile (None where an earlier version made one of them),
     `spent_seconds` the part of `seconds` that was spent in this run; `peak_mib` is the
-    largest resident memory of the process; `evaluation` where the figures of each view are;
+    largest resident memory of the process; `evaluation` where the figures of each view are; `settings` those
+    that were given for its sequence beside the profile, and `image_size` width and height in px;
     `held_out_trained_on` is true of the oracle alone.
     """
     outcome = case.outcome
@@ -312,6 +322,8 @@ def case_of(case: Case) -> dict[str, Any]:
         "sequence": name,
         "setting": setting or None,
         "seed": case.seed,
+        "settings": without_credentials_in(case.given),
+        "image_size": case.image_size,
         "seconds": round(sum(row.made_seconds for row in rows), 3),
         "spent_seconds": round(sum(row.spent_seconds for row in rows), 3),
         "processor_seconds": None

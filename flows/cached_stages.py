@@ -12,7 +12,7 @@ from extrags.config import PipelineConfig
 from extrags.errors import ArtefactGoneError, DamagedArtefactError, ExtragsError
 from extrags.pipeline import STAGES, Pipeline, StageName
 from extrags.redaction import without_credentials
-from extrags.store import Manifest, Ref, Store, forget_loaded
+from extrags.store import Manifest, Ref, Store, digest_of, forget_loaded
 from extrags.store.runs import RunRecord, recorded_run
 from flows.damage import again_after_damage
 from flows.estimate import expected_seconds
@@ -76,7 +76,7 @@ class CachedStages(Pipeline):
             if isinstance(self.runner, StoreRunner):
                 self._attempt(until)  # Who only looks moves nothing.
             else:
-                with recorded_run(self.store, self.outcome.name) as self._record:
+                with recorded_run(self.store, self.outcome.name, digest_of(self._given)) as self._record:
                     again_after_damage(self.store, lambda: self._attempt(until))
         except (_StoppedError, ArtefactGoneError, DamagedArtefactError) as error:
             if not isinstance(error, _StoppedError):

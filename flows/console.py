@@ -72,8 +72,16 @@ def _change(name: str, coarse: float | None, final: float | None) -> str:
     return f"{figure(name, coarse)} → {figure(name, final)}"
 
 
-def print_plan(outcome: SequenceOutcome) -> None:
-    """The scene plan, decision by decision."""
+def print_plan(outcome: SequenceOutcome, *, metric: bool) -> None:
+    """The scene plan, decision by decision, and what it rests on.
+
+    Args:
+        outcome: of the sequence.
+        metric: whether lengths of its scene are millimetres.
+    """
+    # Here, because it loads torch, which a process that only looks up results must not.
+    from extrags.report.measurements import measurement_rows
+
     out = console()
     plan = outcome.plan or {"decisions": [], "measurements": {}}
     table = Table(box=None, pad_edge=False, header_style="bold", title=f"plan for {escape(outcome.name)}")
@@ -85,5 +93,9 @@ def print_plan(outcome: SequenceOutcome) -> None:
         saves = "-" if line.get("saves_s") is None else f"{line['saves_s']:.1f}"
         table.add_row(line["stage"], runs, budget, saves, escape(line["reason"]))
     out.print(table)
-    figures = ", ".join(f"{name} {value:.4g}" for name, value in plan["measurements"].items())
-    out.print(f"[dim]measured: {figures}[/]")
+    measured = Table(box=None, pad_edge=False, show_header=False, title="measured", title_justify="left")
+    measured.add_column(style="dim")
+    measured.add_column(justify="right")
+    for label, value in measurement_rows(plan["measurements"], metric=metric):
+        measured.add_row(label, value)
+    out.print(measured)

@@ -159,7 +159,9 @@ def reconstruct_dataset(
         report = None
         if until == "report":
             label = profile_label(profile, method if methods is None else ", ".join(methods))
-            report = dataset_page(outcomes, name, label, PrefectRunner(store, refresh, limits))
+            given = [case.settings for case in cases]
+            pages = PrefectRunner(store, refresh, limits)
+            report = dataset_page(outcomes, given, name, label, Store(store), pages)
         return DatasetOutcome(outcomes, report)
 
     config = cases[0].config()

@@ -5,24 +5,34 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from flows.outcome import Part, SequenceOutcome
+from extrags.store import Store
+from flows.outcome import NOT_COUNTED, Part, SequenceOutcome
 from flows.runners import Call, Runner
 from tasks.benchmark import benchmark_report
 from tasks.report import PAGE, dataset_report
 
-__all__ = ["benchmark_page", "dataset_page"]
+__all__ = ["benchmark_page", "dataset_page", "image_size"]
 
 COMPARED_VIEWS = 4
 """Held-out views of each sequence that are shown side by side."""
 
 
-def dataset_page(outcomes: Sequence[SequenceOutcome], name: str, profile: str, runner: Runner) -> str:
+def dataset_page(
+    outcomes: Sequence[SequenceOutcome],
+    settings: Sequence[Mapping[str, Any]],
+    name: str,
+    profile: str,
+    store: Store,
+    runner: Runner,
+) -> str:
     """Make the page.
 
     Args:
         outcomes: one per sequence, failures among them.
+        settings: that were given for each beside the profile, by dotted name.
         name: title.
         profile: name of the profile of the settings.
+        store: with the artefacts of the runs.
         runner: how artefacts are made.
 
     Returns:
@@ -54,10 +64,24 @@ def dataset_page(outcomes: Sequence[SequenceOutcome], name: str, profile: str, r
             outcome.title: outcome.refs["report"] for outcome in outcomes if "report" in outcome.refs
         },
         "failures": failures,
+        "settings": [dict(given) for given in settings],
+        "sizes": [image_size(outcome, store) for outcome in outcomes],
         "rows": [outcome.to_json() for outcome in outcomes],
     }
     (page,) = runner.run([Call(dataset_report, inputs)], name)
     return f"{page.ref.uri}/{PAGE}"
+
+
+def image_size(outcome: SequenceOutcome, store: Store) -> tuple[int, int] | None:
+    """Width and height of the images of a run in px; None where nothing was read.
+
+    Raises:
+        StoreError: when the store cannot be read.
+    """
+    if "ingest" not in outcome.refs:
+        return None
+    counts = store.manifest(outcome.refs["ingest"]).counts
+    return int(counts["width"] or 0), int(counts["height"] or 0)
 
 
 def benchmark_page(
@@ -93,7 +117,7 @@ def benchmark_page(
     contender = ([method for method in rivals if method != CEILING] or rivals)[-1:]
     pictures = [pair for method in contender for pair in _pairs(cases, baseline, method)]
     shown = sorted({pair[side] for pair in pictures for side in ("baseline", "contender")}, key=int)
-    keys = ("method", "profile", "sequence", "setting", "seed")
+    keys = ("method", "profile", "sequence", "setting", "seed", "settings", "image_size")
     inputs = {
         "name": name,
         "baseline": baseline,
@@ -109,11 +133,23 @@ def benchmark_page(
         "sequences": {index: outcomes[int(index)].refs["sequence"] for index in shown},
         "renders": {index: outcomes[int(index)].final_renders for index in shown},
         "views": COMPARED_VIEWS,
-        "rows": [{key: case[key] for key in ("seconds", "peak_mib")} for case in cases],
+        "rows": [
+            {"seconds": case["seconds"], "peak_mib": case["peak_mib"], "stages": _made(outcome)}
+            for outcome, case in zip(outcomes, cases, strict=True)
+        ],
         "history": dict(history or {}),
     }
     (page,) = runner.run([Call(benchmark_report, inputs)], name)
     return f"{page.ref.uri}/{PAGE}"
+
+
+def _made(outcome: SequenceOutcome) -> list[dict[str, Any]]:
+    """What the stages that count in a run's time consist of, and how long they took when they were made."""
+    return [
+        {key: row.to_json()[key] for key in ("artefacts", "made_seconds")}
+        for row in outcome.stages
+        if row.stage not in NOT_COUNTED
+    ]
 
 
 def _pairs(cases: Sequence[Mapping[str, Any]], baseline: str, contender: str) -> list[dict[str, str]]:

@@ -36,6 +36,8 @@ TASKS = {
 
 SCENES = frozenset({"continued-coarse", "import-scene", "uc-nerf"})
 """Tasks that make what the stage `coarse` otherwise makes."""
+OTHER_SETTINGS = "other settings"
+"""Variant of what is being run with settings that no run on record has."""
 FRAMES = frozenset({"training-frames", "depth-frames", "refined-frames"})
 """Tasks that several stages have run: they do not tell how far a run has come."""
 
@@ -179,7 +181,9 @@ def store_status(store: Store, patterns: Sequence[str] = ()) -> StoreStatus:
     keys = store.keys()
     there = set(keys)
     running: dict[str, set[str]] = {}
-    for item in in_work(store):
+    # Pages of several sequences are in work under a name of their own.
+    making = [item for item in in_work(store) if _stage_of(item["stage"]) in STAGES]
+    for item in making:
         running.setdefault(item["label"], set()).add(_stage_of(item["stage"]))
     going_on = active_runs(store)
     for run in going_on:
@@ -196,7 +200,7 @@ def store_status(store: Store, patterns: Sequence[str] = ()) -> StoreStatus:
         recorded |= set(made)
         if name in names:
             bytes_of |= {key: size for key, size in made.items() if key in there}
-            row = _row(record, there, running.get(record["sequence"], set()))
+            row = _row(record, there, _making(record, making, going_on))
             rows.append(replace(row, sequence=name))
     shown = {row.sequence for row in rows}
     for name in names:
@@ -204,6 +208,12 @@ def store_status(store: Store, patterns: Sequence[str] = ()) -> StoreStatus:
             manifests = _manifests(store, unfinished[name].keys & there) if name in unfinished else []
             bytes_of |= {manifest.key: manifest.bytes for manifest in manifests}
             rows.append(_unrecorded(name, unfinished.get(name), running.get(name), manifests))
+    for name, run in _unlike(found, going_on).items():
+        if name in shown:
+            manifests = _manifests(store, run.keys & there)
+            bytes_of |= {manifest.key: manifest.bytes for manifest in manifests}
+            row = _unrecorded(name, run, running.get(name, set()), manifests)
+            rows.append(replace(row, variant=OTHER_SETTINGS))
     order = {name: place for place, name in enumerate(names)}
     rows.sort(key=lambda row: (order[row.sequence], row.variant))
     counts: dict[State, int] = {}
@@ -238,6 +248,36 @@ def _unfinished(store: Store, going_on: Sequence[Run], ended: set[str]) -> dict[
         keys = frozenset(key for run in going_on if run.sequence == name for key in run.keys)
         found[name] = Run("", name, "", keys)
     return found
+
+
+def _making(record: OutcomeRecord, making: Sequence[Mapping[str, str]], going_on: Sequence[Run]) -> set[str]:
+    """Stages of a run on record that are being made again now.
+
+    What is made for runs with other settings alone is none of them, unless this run has the artefact as well.
+    Where nothing tells the settings of the runs that are going on, it may be any.
+    """
+    own = {key for row in record["stages"] for key in row["artefacts"]}
+    runs = [run for run in going_on if run.sequence == record["sequence"]]
+    unlike = bool(runs) and all(_has_other_settings(run, record) for run in runs)
+    return {
+        _stage_of(item["stage"])
+        for item in making
+        if item["label"] == record["sequence"] and (item["key"] in own or not unlike)
+    }
+
+
+def _unlike(records: Sequence[OutcomeRecord], going_on: Sequence[Run]) -> dict[str, Run]:
+    """By sequence: what runs with settings that none on record of it has have made so far."""
+    keys: dict[str, frozenset[str]] = {}
+    for run in going_on:
+        same = [record for record in records if record["sequence"] == run.sequence]
+        if same and all(_has_other_settings(run, record) for record in same):
+            keys[run.sequence] = keys.get(run.sequence, frozenset()) | run.keys
+    return {name: Run("", name, "", found) for name, found in keys.items()}
+
+
+def _has_other_settings(run: Run, record: OutcomeRecord) -> bool:
+    return bool(run.config) and run.config != record.get("config")
 
 
 def _manifests(store: Store, keys: Iterable[str]) -> list[Manifest]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from extrags.redaction import without_credentials, without_credentials_in
 from extrags.store import Ref, Slot
 from tasks.evaluate import METRICS_FILE
 from tasks.report import PAGE
@@ -19,7 +20,7 @@ PER_VIEW_FILE = "per_view.json"
 
 # `rows` holds times and memory of the runs, `history` those of earlier ones. The page shows them, but they
 # are not part of its cache key; a run that measures anew makes its page anew as well.
-@stage("benchmark-report", version=7, ignore=("rows", "history"))
+@stage("benchmark-report", version=8, ignore=("rows", "history"))
 def benchmark_report(
     slot: Slot,
     name: str,
@@ -42,14 +43,14 @@ def benchmark_report(
         name: title of the page.
         baseline: method the others are compared with.
         methods: a description of each method.
-        runs: `{method, profile, sequence, setting, seed}` of each.
+        runs: `{method, profile, sequence, setting, seed, settings, image_size}` of each.
         metrics: artefact with the metrics of each run, by its index as text; failed runs have none.
         failures: error messages of failed runs, by the same index.
         pictures: `{baseline, contender, label}`: two runs, by index as text, shown side by side.
         sequences: the sequence of each run that is shown, by index.
         renders: its renders.
         views: rows of pictures per pair at most.
-        rows: `{seconds, peak_mib}` of each run.
+        rows: `{seconds, stages, peak_mib}` of each run.
         history: `{trend, regressions, not_judged}`: see `BenchmarkInputs`; empty where nothing is on record.
     """
     from extrags.metrics.comparison import compare_runs
@@ -87,9 +88,9 @@ def benchmark_report(
             not_judged=history.get("not_judged", ()),
         )
     )
-    (slot.path / PAGE).write_text(page, encoding="utf-8")
+    (slot.path / PAGE).write_text(without_credentials(page), encoding="utf-8")
     slot.save_json(COMPARISON_FILE, compare_runs(every, baseline), indent=1)
-    slot.save_json(PER_VIEW_FILE, _per_view(runs, found), indent=1)
+    slot.save_json(PER_VIEW_FILE, without_credentials_in(_per_view(runs, found)), indent=1)
     slot.counts.update(runs=len(runs), kib=round(len(page.encode()) / 1024))
 
 

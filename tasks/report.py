@@ -48,7 +48,7 @@ REPORT_PARTS: tuple[ReportPart, ...] = get_args(ReportPart)
 
 # `rows` holds the times of the stages in this run. The page shows them, but they are not part of its cache
 # key.
-@stage("report", version=14, ignore=("rows",))
+@stage("report", version=15, ignore=("rows",))
 def report(
     slot: Slot,
     parts: dict[str, Ref],
@@ -158,7 +158,7 @@ def _absent(skipped: dict[str, str]) -> dict[str, str]:
     }
 
 
-@stage("dataset-report", version=6, ignore=("rows",))
+@stage("dataset-report", version=7, ignore=("rows",))
 def dataset_report(
     slot: Slot,
     name: str,
@@ -167,6 +167,8 @@ def dataset_report(
     metrics: dict[str, Ref],
     reports: dict[str, Ref],
     failures: dict[str, str],
+    settings: list[dict[str, Any]],
+    sizes: list[tuple[int, int] | None],
     rows: list[dict[str, Any]],
 ) -> None:
     """Build the page that compares sequences; writes `report.html` and `content.json`.
@@ -179,6 +181,8 @@ def dataset_report(
         metrics: artefacts with the metrics of each sequence, by `NAME coarse` and `NAME final`.
         reports: artefacts with the pages that are linked, by sequence; they stay as long as this page does.
         failures: error messages by sequence.
+        settings: that were given for each sequence beside the profile, by dotted name.
+        sizes: width and height of its images in px; None where nothing was read.
         rows: `SequenceOutcome.to_json()` of each: times and states, not part of the cache key.
     """
     from extrags.report.dataset import DatasetRow, build_dataset_report
@@ -199,8 +203,10 @@ def dataset_report(
             stages=row["stages"],
             error=failures.get(sequence, ""),
             link=_neighbour(reports.get(sequence)),
+            settings=given,
+            image_size=size,
         )
-        for sequence, row in zip(sequences, rows, strict=True)
+        for sequence, given, size, row in zip(sequences, settings, sizes, rows, strict=True)
     ]
     page, content = (
         build_dataset_report(every, name=name, profile=profile)

@@ -107,6 +107,8 @@ class Metric:
         description: a sentence on the metric for the pages.
         version: of a metric registered by a program: raised whenever its values could change, as it is part
             of the key under which results are cached.
+        coverage: key of the metric that says which share of the pixels this one is over, where that depends
+            on the render; empty where all count.
 
     Raises:
         ConfigError: for an invalid key, or groups that do not exist for the kind.
@@ -126,6 +128,7 @@ class Metric:
     shown: Mapping[Place, tuple[str, ...]] = field(default_factory=lambda: _EVERYWHERE)
     description: str = ""
     version: int = 1
+    coverage: str = ""
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[a-z][a-z0-9_]*", self.key):
@@ -153,6 +156,7 @@ class Figure:
         higher_is_better: as the metric's.
         digits: as the metric's.
         table_digits: as the metric's.
+        coverage: name of the figure that says which share of the pixels this one is over; empty for all.
     """
 
     key: str
@@ -162,6 +166,7 @@ class Figure:
     higher_is_better: bool
     digits: int
     table_digits: int
+    coverage: str = ""
 
 
 def _loaded_late(module: str, name: str) -> Measure:
@@ -227,11 +232,20 @@ _BUILT_IN = (
         kind="depth",
         shown={"tables": _TOP, "tiles": _TOP, "columns": _TOP, "differences": _TOP, "charts": _TOP},
         description="Mean of |rendered − true| / true over pixels with true depth and rendered opacity of "  # noqa: RUF001
-        "at least one half. Exposure does not touch it.",
+        "at least one half. Exposure does not touch it. The coverage is the share of the pixels with true "
+        "depth that count; where it differs by more than 1 %, the errors are over different pixels, and "
+        "neither is called better.",
+        coverage="depth_coverage",
     ),
-    Metric("depth_rmse", "Depth RMSE", False, unit="mm", kind="depth", shown={}),
-    Metric("depth_delta125", "Depth δ < 1.25", True, kind="depth", shown={}),
-    Metric("depth_coverage", "Depth coverage", True, kind="depth", shown={}),
+    Metric(
+        "depth_coverage",
+        "Depth coverage",
+        True,
+        kind="depth",
+        shown={"tables": _TOP, "columns": _TOP, "differences": _TOP},
+    ),
+    Metric("depth_rmse", "Depth RMSE", False, unit="mm", kind="depth", shown={}, coverage="depth_coverage"),
+    Metric("depth_delta125", "Depth δ < 1.25", True, kind="depth", shown={}, coverage="depth_coverage"),
     Metric(
         "accuracy_mm",
         "Surface accuracy",
@@ -339,4 +353,5 @@ def _figure(metric: Metric, group: str) -> Figure:
         metric.higher_is_better,
         metric.digits,
         metric.table_digits,
+        ".".join(part for part in (group, metric.coverage) if metric.coverage and part),
     )

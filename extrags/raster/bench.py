@@ -14,7 +14,6 @@ import math
 import os
 import platform
 import resource
-import subprocess
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -28,6 +27,7 @@ from extrags.errors import ConfigError
 from extrags.raster import native
 from extrags.raster.peers import TimedPeer, check_peers, errors, exact_gradients, gradients, use_threads
 from extrags.raster.roofline import part_times, roofline
+from extrags.source_commit import source_commit
 
 __all__ = ["STANDARD_SIZES", "BenchSize", "bench_raster", "bench_scene", "bench_train", "machine"]
 
@@ -97,9 +97,6 @@ def machine() -> dict[str, Any]:
     if info.exists():
         names = [x for x in info.read_text().splitlines() if x.startswith("model name")]
         processor = names[0].split(":", 1)[1].strip() if names else processor
-    git = subprocess.run(
-        ["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False, cwd=Path(__file__).parent
-    )
     load = os.getloadavg()[0]
     return {
         "processor": processor,
@@ -113,7 +110,7 @@ def machine() -> dict[str, Any]:
             "numpy": version("numpy"),
             "extrags": version("extrags"),
         },
-        "commit": git.stdout.strip() or None,
+        "commit": source_commit(),
     }
 
 

@@ -12,8 +12,9 @@ from extrags.report.charts import method_colors, methods_chart, pairs_chart
 from extrags.report.comparison import RenderedMethod, compared_rows
 from extrags.report.downloads import Chart
 from extrags.report.page import rendered_page
+from extrags.report.run_facts import given_settings, seconds_of_all, shared_facts
 from extrags.report.trend import trend_chart
-from extrags.report.wording import count, described_metrics, duration, number, percent
+from extrags.report.wording import count, described_metrics, duration, number, percent, same_pixels
 from extrags.sequence import EndoscopicSequence
 
 __all__ = ["BenchmarkInputs", "ComparedViews", "build_benchmark_report"]
@@ -48,8 +49,10 @@ class BenchmarkInputs:
 
     Args:
         name: title.
-        runs: `{method, profile, sequence, setting, seed, seconds, peak_mib, metrics, error}` of each;
-            `metrics` is None for a failed run, whose `error` says why.
+        runs: `{method, profile, sequence, setting, seed, settings, image_size, seconds, stages, peak_mib,
+            metrics, error}` of each; `metrics` is None for a failed run, whose `error` says why. `settings`
+            were given beside the profile, `image_size` is width and height in px, and of `stages`
+            `{artefacts, made_seconds}` tell what runs share; these three may be missing.
         baseline: method the others are compared with.
         methods: what each method is, in words, in the order they are shown.
         pictures: held-out views side by side.
@@ -86,6 +89,7 @@ def build_benchmark_report(inputs: BenchmarkInputs) -> str:
         for column in figures("columns")
         if any(figure_of(run["metrics"], column.name) is not None for run in measured)
     ]
+    settings = [run.get("settings", {}) for run in inputs.runs]
     images = sum(5 * min(inputs.views, len(pair.sequence.test)) for pair in inputs.pictures)
     largest = LARGEST_PAGE_BYTES // max(images, 1)
     return rendered_page(
@@ -98,8 +102,13 @@ def build_benchmark_report(inputs: BenchmarkInputs) -> str:
             ("Runs", count(len(inputs.runs))),
             ("Sequences", count(len({(run["sequence"], run["setting"]) for run in inputs.runs}))),
             ("Seeds", count(len({run["seed"] for run in inputs.runs}))),
-            ("Run time of all", duration(sum(run["seconds"] for run in inputs.runs))),
+            (
+                "Run time of all",
+                duration(seconds_of_all((run["seconds"], run.get("stages", ())) for run in inputs.runs)),
+            ),
+            *shared_facts([run.get("image_size") for run in inputs.runs], settings),
         ],
+        given=given_settings([_label(run) for run in inputs.runs], settings),
         methods=inputs.methods,
         failures=[
             (f"{_label(run)}, {run['method']}, seed {run['seed']}", run["error"] or "no reason was recorded")
@@ -127,7 +136,11 @@ def build_benchmark_report(inputs: BenchmarkInputs) -> str:
             )
             for pair in inputs.pictures
         ],
-        protocol={"version": None, "metrics": described_metrics(*(run["metrics"] for run in measured))},
+        protocol={
+            "version": None,
+            "metrics": described_metrics(*(run["metrics"] for run in measured)),
+            "surface": any(column.name.startswith("surface.") for column in columns),
+        },
     )
 
 
@@ -166,7 +179,7 @@ def _rows(
             "method": row["method"],
             "sizes": _sizes(row),
             "cells": [
-                cell(row["figures"][column.name], column) if column.name in row["figures"] else NO_CELL
+                cell(row["figures"], column) if column.name in row["figures"] else NO_CELL
                 for column in columns
             ],
         }
@@ -174,13 +187,18 @@ def _rows(
     ]
 
 
-def _mean_cell(figure: Mapping[str, Any], column: Figure) -> dict[str, str]:
+def _mean_cell(found: Mapping[str, Any], column: Figure) -> dict[str, str]:
+    figure = found[column.name]
     deviation = figure["deviation"]
     note = "" if deviation is None else f"± {number(deviation, column.digits)}"
     return {**NO_CELL, "value": number(figure["mean"], column.digits), "note": note}
 
 
-def _difference_cell(figure: Mapping[str, Any], column: Figure) -> dict[str, str]:
+def _difference_cell(found: Mapping[str, Any], column: Figure) -> dict[str, str]:
+    figure = found[column.name]
+    if (more := _more_covered(found, column)) is not None:
+        note = f"over {'more' if more > 0 else 'fewer'} pixels: see the coverage"
+        return {**NO_CELL, "value": number(figure["mean"], column.digits, signed=True), "note": note}
     if round(figure["mean"], column.digits) == 0:
         verdict = "equal"
     else:
@@ -193,7 +211,14 @@ def _difference_cell(figure: Mapping[str, Any], column: Figure) -> dict[str, str
     }
 
 
-def _share_cell(figure: Mapping[str, Any], column: Figure) -> dict[str, str]:
+def _more_covered(found: Mapping[str, Any], column: Figure) -> float | None:
+    """The difference in coverage where it is too large for the figure to be judged; else None."""
+    share = found.get(column.coverage)
+    return None if share is None or same_pixels(0.0, share["mean"]) else float(share["mean"])
+
+
+def _share_cell(found: Mapping[str, Any], column: Figure) -> dict[str, str]:
+    figure = found[column.name]
     note = "" if figure["low"] is None else f"{percent(figure['low'])} to {percent(figure['high'])}"
     return {**NO_CELL, "value": percent(figure["mean"]), "note": note}
 
@@ -220,17 +245,23 @@ def _difference_chart(
         return None
     several = len({row["method"] for row in rows}) > 1
     line_of = _line_names(rows)
-    lines = []
+    lines: list[tuple[str, list[tuple[float, float | None, float | None] | None]]] = []
+    unjudged: set[tuple[int, int]] = set()
     for row in rows:
         given = [row["figures"].get(panel.name) for panel in panels]
         cells = [None if found is None else (found["mean"], found["low"], found["high"]) for found in given]
+        unjudged |= {
+            (len(lines), place)
+            for place, panel in enumerate(panels)
+            if _more_covered(row["figures"], panel) is not None
+        }
         lines.append((f"{row['method']}, {line_of(row)}" if several else line_of(row), cells))
     titles = [
         (f"{panel.label} ({panel.unit})" if panel.unit else panel.label, panel.higher_is_better)
         for panel in panels
     ]
     alt = f"Differences to {baseline} of each sequence with their 95 % intervals over the seeds"
-    return pairs_chart(titles, lines), alt
+    return pairs_chart(titles, lines, unjudged), alt
 
 
 def _figure_charts(

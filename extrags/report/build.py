@@ -21,11 +21,19 @@ from extrags.report.numbers import (
     protocol,
     regions,
     summary,
+    surface_rows,
     tiles,
     unobserved_shares,
 )
 from extrags.report.page import rendered_page
-from extrags.report.run_tables import facts, plan_rows, setting_groups, stage_rows, stage_summary
+from extrags.report.run_tables import (
+    facts,
+    plan_rows,
+    setting_groups,
+    stage_rows,
+    stage_summary,
+    usual_settings,
+)
 from extrags.report.space import occupancy_slices, scene_views, trajectory_colors
 from extrags.report.viewer.content import viewer_section
 from extrags.report.views import depth_rows, held_out_rows, virtual_rows
@@ -78,6 +86,7 @@ def build_pages(inputs: ReportInputs, config: ReportConfig) -> tuple[str, str]:
         summary=summary(inputs),
         tiles=tiles(inputs),
         regions=regions(inputs),
+        surface=surface_rows(inputs),
         missing_reasons=missing_reasons(inputs),
         numbers_csv=numbers_csv(inputs),
         per_view_csv=per_view_csv(inputs),
@@ -91,7 +100,8 @@ def build_pages(inputs: ReportInputs, config: ReportConfig) -> tuple[str, str]:
         without_pose=inputs.without_pose[1],
         stages_absent="No stage times were handed to this report.",
         protocol=protocol(inputs),
-        settings=setting_groups(inputs.config),
+        settings=setting_groups(inputs.config, inputs.profile),
+        usual=usual_settings(inputs.profile)[0],
     )
     pages = [
         rendered_page(
@@ -117,12 +127,16 @@ def _views(inputs: ReportInputs, config: ReportConfig) -> dict[str, Any]:
     largest = IMAGE_BYTES // max(1, images)
     coarse, final = per_view_psnr(inputs.coarse_metrics), per_view_psnr(inputs.final_metrics)
     names = [inputs.sequence.frame_name(int(frame)) for frame in inputs.frames]
-    chart = None if coarse is None else views_chart(coarse, final, unobserved_shares(inputs), names)
+    unseen = unobserved_shares(inputs)
+    chart = None if coarse is None else views_chart(coarse, final, unseen, names)
     return {
         "held_out": held_out_rows(inputs, held_out, largest) if held_out else None,
         "held_out_absent": inputs.why_absent("coarse", "evaluate"),
         "final_absent": None if inputs.final is not None else inputs.why_absent("final", "finetune"),
         "views_chart": chart,
+        "views_chart_words": _views_chart_words(
+            final=final is not None, scatter=final is not None and unseen is not None
+        ),
         "depth": depth_rows(inputs, held_out, largest) if has_depth else None,
         "estimated": None
         if inputs.depth is None
@@ -133,7 +147,26 @@ def _views(inputs: ReportInputs, config: ReportConfig) -> dict[str, Any]:
         else None,
         "virtual_absent": inputs.why_absent("pseudo", "enhance"),
         "restorer": None if inputs.pseudo is None else restorer_words(inputs.pseudo.provenance),
+        "not_restored": _not_restored(inputs),
     }
+
+
+def _not_restored(inputs: ReportInputs) -> str:
+    """How many virtual views of the exploration were not restored; empty where all were, or nobody knows."""
+    found = (inputs.exploration or {}).get("virtual_views")
+    if inputs.pseudo is None or found is None or found <= len(inputs.pseudo.rendered):
+        return ""
+    return (
+        f"The exploration found {count(found)} views; {count(len(inputs.pseudo.rendered))} of them were "
+        "restored, as many as enhance.max_views allows."
+    )
+
+
+def _views_chart_words(*, final: bool, scatter: bool) -> str:
+    """What the chart of the held-out views shows."""
+    scenes = "the coarse and the final scene" if final else "the coarse scene"
+    said = f"PSNR of every held-out view in {scenes}"
+    return f"{said}, and the gain against the share of pixels that training never saw" if scatter else said
 
 
 def _space(inputs: ReportInputs) -> dict[str, Any]:
@@ -214,7 +247,8 @@ def _exploration(inputs: ReportInputs) -> dict[str, Any] | None:
             {
                 "color": colors[index],
                 "start": inputs.sequence.frame_name(said["anchor_frame"]) if said else "",
-                "views": len(poses),
+                # The first one is the real view it starts from.
+                "views": len(poses) - 1,
                 "length": number(length, 1),
                 "gain": f"{_worth_percent(said, summary):.2f} %" if said else "",
                 "reason": said.get("reason", ""),

@@ -10,13 +10,14 @@ import re
 import textwrap
 import threading
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from extrags.report.chart_labels import row_labels
 from extrags.report.downloads import Cell, Chart, file_name
 from extrags.report.encode import data_uri
 
@@ -43,7 +44,6 @@ METHOD_COLORS = (FINAL_COLOR, "#c2702a", "#6b4ea0", "#3d7dbd", "#9a3b5b", "#7a7f
 METHOD_MARKS = ("o", "s", "^", "D", "v", "P", "X", "*")
 """Of methods that share a colour."""
 LEGEND_COLUMNS = 4
-LONGEST_NAME = 41
 INK = "#1d2733"
 QUIET = "#5b6774"
 RULE = "#d9dee4"
@@ -264,7 +264,7 @@ def sequences_chart(
         left.scatter(
             coarse, row, s=18, facecolor="white", edgecolor=COARSE_COLOR, linewidth=1.4, label="coarse"
         )
-        left.set_yticks(row, [_shortened(name) for name in names])
+        left.set_yticks(row, row_labels(names))
         left.set_ylim(-0.6, len(names) - 0.4)
         left.grid(axis="x")
         left.set_title("PSNR on held-out views (dB)")
@@ -288,14 +288,6 @@ def sequences_chart(
         for place, name in enumerate(names)
     ]
     return chart.with_numbers("sequences", header, rows)
-
-
-def _shortened(name: str) -> str:
-    """A name that leaves room for the axes; its beginning and its end tell the most."""
-    if len(name) <= LONGEST_NAME:
-        return name
-    half = (LONGEST_NAME - 1) // 2
-    return f"{name[:half]}…{name[-half:]}"
 
 
 def method_colors(methods: Sequence[str], baseline: str) -> dict[str, str]:
@@ -354,7 +346,7 @@ def methods_chart(
                 took = np.asarray(seconds[method][group], dtype=np.float64)
                 right.scatter(took, found, s=16, color=color, alpha=0.8, linewidth=0, marker=mark)
             left.scatter([], [], s=22, color=color, label=method, marker=mark)
-        left.set_yticks(row, [_shortened(group) for group in groups])
+        left.set_yticks(row, row_labels(groups))
         left.set_ylim(-0.6, len(groups) - 0.4)
         left.grid(axis="x")
         left.set_title(title)
@@ -386,6 +378,7 @@ def methods_chart(
 def pairs_chart(
     panels: Sequence[tuple[str, bool]],
     rows: Sequence[tuple[str, Sequence[tuple[float, float | None, float | None] | None]]],
+    unjudged: Collection[tuple[int, int]] = (),
 ) -> Chart:
     """Paired differences with their 95 % intervals, one panel per figure, zero marked.
 
@@ -393,6 +386,7 @@ def pairs_chart(
         panels: title of each figure, and whether more is better.
         rows: name of each line, from the top, and by panel mean, low and high; None where there is no
             difference, no interval for a single pair.
+        unjudged: row and panel of differences of which neither sign is the better one.
     """
     from matplotlib.ticker import MaxNLocator
 
@@ -402,13 +396,13 @@ def pairs_chart(
         place = np.arange(len(rows))[::-1]
         for column, (panel, (title, higher_is_better)) in enumerate(zip(axes, panels, strict=True)):
             panel.axvline(0, color=QUIET, linewidth=0.8)
-            for at, (_, cells) in zip(place, rows, strict=True):
+            for line, (at, (_, cells)) in enumerate(zip(place, rows, strict=True)):
                 cell = cells[column]
                 if cell is None:
                     continue
                 mean, low, high = cell
                 color = FINAL_COLOR if (mean > 0) == higher_is_better else WORSE_COLOR
-                if mean == 0:
+                if mean == 0 or (line, column) in unjudged:
                     color = COARSE_COLOR
                 if low is not None and high is not None:
                     panel.hlines(at, low, high, color=color, linewidth=2.2, alpha=0.4)
@@ -418,7 +412,7 @@ def pairs_chart(
             panel.xaxis.set_major_locator(MaxNLocator(4, min_n_ticks=2))
             panel.grid(axis="x")
             panel.grid(visible=False, axis="y")
-        axes[0].set_yticks(place, [name for name, _ in rows])
+        axes[0].set_yticks(place, row_labels([name for name, _ in rows]))
         chart = svg_image(figure)
     numbers: list[list[Cell]] = [
         [name, title, *cell]

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from statistics import fmean
 from typing import Any, Literal
 
@@ -13,6 +13,7 @@ import numpy as np
 from extrags.metrics.registry import Metric, metric_named
 from extrags.report.charts import sequences_chart
 from extrags.report.page import rendered_page
+from extrags.report.run_facts import given_settings, seconds_of_all, shared_facts
 from extrags.report.wording import (
     compare,
     count,
@@ -42,6 +43,8 @@ class DatasetRow:
         seed: of the run, when there are several of the same sequence and variant.
         variant: what else sets it apart from other runs of the same sequence, in words.
         link: relative address of the sequence's own page; no link when empty.
+        settings: that were given beside the profile, by dotted name.
+        image_size: width and height in px; None where it is not known.
     """
 
     name: str
@@ -54,6 +57,8 @@ class DatasetRow:
     seed: int | None = None
     variant: str = ""
     link: str = ""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    image_size: Sequence[int] | None = None
 
     @property
     def label(self) -> str:
@@ -99,19 +104,21 @@ def build_dataset_report(
             *([("Runs", count(len(rows)))] if _kind(rows) == "runs" else []),
             ("Completed", count(sum(row.status == "completed" for row in rows))),
             ("Failed", count(sum(row.status == "failed" for row in rows))),
-            ("Time to make all", duration(_seconds_of_all(rows))),
+            ("Time to make all", duration(seconds_of_all((row.seconds, row.stages) for row in rows))),
+            *shared_facts([row.image_size for row in rows], [row.settings for row in rows]),
         ],
+        given=given_settings([row.name for row in rows], [row.settings for row in rows]),
         failures=[
             (row.label, row.error or "no reason was recorded") for row in rows if row.status == "failed"
         ],
         metrics=metrics,
         rows=[_table_row(row, metrics) for row in rows],
-        means=[_mean_cell(metric, _means_of_seeds(rows, metric, ())) for metric in metrics],
-        unobserved=[_mean_cell(metric, _means_of_seeds(rows, metric, ("unobserved",))) for metric in metrics],
+        means=[_mean_cell(metric, _by_sequence(rows).values(), ()) for metric in metrics],
+        unobserved=[_mean_cell(metric, _by_sequence(rows).values(), ("unobserved",)) for metric in metrics],
         compared=len(_means_of_seeds(rows, psnr, ())),
         seeds=_seed_rows(rows, metrics),
         chart=chart,
-        protocol={"version": None, "metrics": described_metrics(*trees)},
+        protocol={"version": None, "metrics": described_metrics(*trees), "surface": False},
     )
 
 
@@ -128,18 +135,6 @@ def _summary(rows: Sequence[DatasetRow]) -> str:
         f"{text} Over the {len(pairs)} with a coarse and a final scene, PSNR on held-out views changes by "
         f"{number(change, 2, signed=True)} dB on average; {better} of {len(pairs)} gain."
     )
-
-
-def _seconds_of_all(rows: Sequence[DatasetRow]) -> float:
-    """A stage that several rows share counts once."""
-    shared: dict[tuple[str, ...], float] = {}
-    alone = 0.0
-    for row in rows:
-        told = {tuple(stage.get("artefacts", ())): stage.get("made_seconds", 0.0) for stage in row.stages}
-        told.pop((), None)
-        shared |= told
-        alone += max(0.0, row.seconds - sum(told.values()))
-    return sum(shared.values()) + alone
 
 
 def _kind(rows: Sequence[DatasetRow]) -> Literal["sequences", "runs"]:
@@ -163,10 +158,19 @@ def _table_row(row: DatasetRow, metrics: Sequence[Metric]) -> dict[str, Any]:
         "seconds": duration(row.seconds),
         "note": " · ".join(part for part in (", ".join(said), gaussians) if part),
         "cells": [
-            compare(metric, metric_of(row.coarse, metric.key), metric_of(row.final, metric.key))
+            compare(
+                metric,
+                metric_of(row.coarse, metric.key),
+                metric_of(row.final, metric.key),
+                coverage=(_coverage(row.coarse, metric), _coverage(row.final, metric)),
+            )
             for metric in metrics
         ],
     }
+
+
+def _coverage(tree: Mapping[str, Any] | None, metric: Metric) -> float | None:
+    return metric_of(tree, metric.coverage) if metric.coverage else None
 
 
 def _both(row: DatasetRow, metric: Metric, path: tuple[str, ...]) -> tuple[float, float] | None:
@@ -190,17 +194,32 @@ def _means_of_seeds(
     rows: Sequence[DatasetRow], metric: Metric, path: tuple[str, ...]
 ) -> list[tuple[float, float]]:
     """A pair for each sequence, whatever its number of seeds."""
-    found = [_pairs(group, metric, path) for group in _by_sequence(rows).values()]
+    return _means(_by_sequence(rows).values(), metric, path)
+
+
+def _means(
+    groups: Iterable[Sequence[DatasetRow]], metric: Metric, path: tuple[str, ...]
+) -> list[tuple[float, float]]:
+    """The mean pair of each group that has one."""
+    found = [_pairs(group, metric, path) for group in groups]
     return [
         (fmean(first for first, _ in pairs), fmean(last for _, last in pairs)) for pairs in found if pairs
     ]
 
 
-def _mean_cell(metric: Metric, pairs: Sequence[tuple[float, float]]) -> dict[str, Any]:
+def _mean_cell(
+    metric: Metric, groups: Iterable[Sequence[DatasetRow]], path: tuple[str, ...]
+) -> dict[str, Any]:
+    """The mean over groups of rows, each of which counts once."""
+    having = [[row for row in group if _both(row, metric, path) is not None] for group in groups]
+    pairs = _means(having, metric, path)
     if not pairs:
         return {"comparison": compare(metric, None, None), "deviation": ""}
     coarse, final = np.array(pairs).T
-    comparison = compare(metric, float(coarse.mean()), float(final.mean()))
+    coverage: tuple[float | None, float | None] = (None, None)
+    if metric.coverage and (shares := _means(having, metric_named(metric.coverage), path)):
+        coverage = (fmean(first for first, _ in shares), fmean(last for _, last in shares))
+    comparison = compare(metric, float(coarse.mean()), float(final.mean()), coverage=coverage)
     return {"comparison": comparison, "deviation": _deviation(final - coarse, metric.digits)}
 
 
@@ -209,7 +228,7 @@ def _seed_rows(rows: Sequence[DatasetRow], metrics: Sequence[Metric]) -> list[di
         {
             "label": label,
             "seeds": len(group),
-            "cells": [_mean_cell(metric, _pairs(group, metric, ())) for metric in metrics],
+            "cells": [_mean_cell(metric, [[row] for row in group], ()) for metric in metrics],
         }
         for label, group in _by_sequence([row for row in rows if row.seed is not None]).items()
         if len(group) > 1

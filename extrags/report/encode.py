@@ -29,6 +29,8 @@ JPEG_QUALITIES = (92, 85, 75, 60)
 SMALLEST_WIDTH_PX = 48
 OUTSIDE_RGB = (228, 231, 235)
 """Pixels that do not count: a light grey that no colour map holds."""
+UNSEEN_RGB = (90, 220, 235)
+"""Surface that no training frame saw: a cyan that is neither in magma nor in grey images, for all eyes."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ from jaxtyping import Bool, UInt8
 from extrags.errors import ConfigError
 from extrags.metrics.registry import Metric
 from extrags.report.downloads import file_name
-from extrags.report.encode import as_uint8
+from extrags.report.encode import UNSEEN_RGB, as_uint8
 from extrags.report.image_table import ImageCell, Judged, image_cell, judged_table
 from extrags.report.inputs import PseudoLike
 from extrags.report.views import virtual_rows
@@ -27,7 +27,6 @@ KINDS = ("coarse", "final", "restored")
 LABELS = {"coarse": "Coarse", "final": "Final", "restored": "Restored in the image"}
 IMAGES_OF_A_RUN = 16
 """At most: seven of a held-out view, six of a virtual one, and some to spare."""
-UNSEEN_RGB = np.array([240, 150, 30])
 
 
 @dataclass(frozen=True)
@@ -58,7 +57,7 @@ class GalleryRun:
 
 
 def build_gallery(
-    runs: Sequence[GalleryRun], folder: Path, *, title: str, command: str, largest_bytes: int
+    runs: Sequence[GalleryRun], folder: Path, *, title: str, command: str, largest_bytes: int, made: str = ""
 ) -> Path:
     """Write `index.md` and the images of a gallery; what else lies in the folder stays.
 
@@ -71,6 +70,7 @@ def build_gallery(
         title: of the page.
         command: that makes it again, for the page.
         largest_bytes: bound on all images together.
+        made: by which version and when, in words; nothing is said when empty.
 
     Returns:
         The page.
@@ -83,18 +83,18 @@ def build_gallery(
     # An image is bounded by the length of its base64.
     each = largest_bytes * 4 // (3 * IMAGES_OF_A_RUN * len(runs))
     folder.mkdir(parents=True, exist_ok=True)
-    parts = [_head(title, command), *(_strip(run, folder, each, place) for place, run in enumerate(runs))]
+    strips = [_strip(run, folder, each, place) for place, run in enumerate(runs)]
     page = folder / "index.md"
-    page.write_text("\n".join(parts), encoding="utf-8")
+    page.write_text("\n".join([_head(title, command, made), *strips]), encoding="utf-8")
     return page
 
 
-def _head(title: str, command: str) -> str:
+def _head(title: str, command: str, made: str) -> str:
     return (
-        f"# {title}\n\nMade by\n\n```bash\n{command}\n```\n\n"
+        f"# {title}\n\nMade by{f' {made}' if made else ''}\n\n```bash\n{command}\n```\n\n"
         "Of each run stand here the held-out view whose PSNR is the median of all, and the middle one of its "
         "virtual views: none is picked by its looks. Figures below an image are those of this view alone. "
-        "Unless said otherwise, no stage has seen the held-out frames. Orange in *never observed* is surface "
+        "Unless said otherwise, no stage has seen the held-out frames. Cyan in *never observed* is surface "
         "that no training frame saw: what the scenes show there is invented.\n"
     )
 
@@ -186,7 +186,7 @@ def _median_view(result: Mapping[str, Any]) -> int:
 def _tinted(image: UInt8[np.ndarray, "h w 3"], region: Bool[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
     """The image in grey, a region of it in colour."""
     grey = image.astype(np.float64).mean(-1, keepdims=True)
-    tint = (0.35 + 0.65 * grey / 255) * UNSEEN_RGB
+    tint = (0.35 + 0.65 * grey / 255) * np.array(UNSEEN_RGB)
     return np.asarray(np.rint(np.where(region[..., None], tint, grey)).astype(np.uint8))
 
 

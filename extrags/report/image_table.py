@@ -10,6 +10,7 @@ from jaxtyping import Int, UInt8
 
 from extrags.report.encode import (
     OUTSIDE_RGB,
+    UNSEEN_RGB,
     DataImage,
     color_bar,
     color_mapped,
@@ -32,8 +33,6 @@ __all__ = [
 ]
 
 ERROR_COLORMAP = "magma"
-UNSEEN_RGB = (90, 220, 235)
-"""Outline of surface no training frame saw: a cyan that magma does not hold."""
 SCALE_QUANTILE = 0.98
 """The colour scale ends here, so that holes and highlights do not flatten everything else."""
 FINAL_MIN_SCALE = 0.05
@@ -78,7 +77,7 @@ class ImageTable:
     outlined: bool = False
     """Whether unseen surface is outlined somewhere."""
     masked: bool = False
-    """Whether pixels outside a mask are greyed out somewhere."""
+    """Whether pixels outside a mask, or without depth, are greyed out somewhere."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ from extrags.metrics.comparison import figure_of
 from extrags.metrics.registry import Figure, figures
 from extrags.report.downloads import Cell, csv_uri
 from extrags.report.page import rendered_page
-from extrags.report.wording import count, described_metrics, duration, number
+from extrags.report.wording import count, described_metrics, duration, number, same_pixels
 
 __all__ = ["BoardRow", "build_leaderboard"]
 
@@ -105,7 +105,7 @@ def build_leaderboard(rows: Sequence[BoardRow], *, name: str = "Leaderboard") ->
         ],
         rows=[_run(row, shown) for row in rows],
         csv=_csv(rows, shown),
-        protocol={"version": None, "metrics": described_metrics(*trees)},
+        protocol={"version": None, "metrics": described_metrics(*trees), "surface": False},
     )
 
 
@@ -140,17 +140,24 @@ def _warnings(rows: Sequence[BoardRow]) -> list[str]:
 def _board(rows: Sequence[BoardRow], figure: Figure, profile: str) -> dict[str, Any] | None:
     """A figure of one profile, sequences by methods; None where no run has it."""
     values: dict[tuple[str, str], list[float]] = {}
+    shares: dict[tuple[str, str], list[float]] = {}
     for row in rows:
         value = None if row.metrics is None or row.profile != profile else figure_of(row.metrics, figure.name)
         if value is not None and row.status == "ok":
             values.setdefault((row.sequence, row.column), []).append(value)
+            share = figure_of(row.metrics, figure.coverage) if figure.coverage else None
+            if share is not None:
+                shares.setdefault((row.sequence, row.column), []).append(share)
     if not values:
         return None
     methods = _distinct(method for _, method in values)
     ceilings = {row.column for row in rows if row.held_out_trained_on}
+    rivals = [method for method in methods if method not in ceilings]
     sequences = _distinct(sequence for sequence, _ in values)
     datasets = {row.sequence: row.dataset for row in rows}
-    means = {place: fmean(found) for place, found in values.items()}
+    means, covered = (
+        {place: fmean(found) for place, found in by_place.items()} for by_place in (values, shares)
+    )
     complete = [item for item in sequences if all((item, method) in means for method in methods)]
     lines = []
     for sequence in sequences:
@@ -165,10 +172,17 @@ def _board(rows: Sequence[BoardRow], figure: Figure, profile: str) -> dict[str, 
                 "dataset": datasets[sequence],
                 "cells": [
                     {**cell, "note": note}
-                    for cell, note in zip(_cells(cells, figure, ceilings), deviations, strict=True)
+                    for cell, note in zip(
+                        _cells(cells, figure, ceilings, [covered.get((sequence, name)) for name in rivals]),
+                        deviations,
+                        strict=True,
+                    )
                 ],
             }
         )
+    # One sequence whose pixels differ is enough for the means to be of different pixels.
+    by_sequence = [[covered.get((item, method)) for method in rivals] for item in complete]
+    apart = next((found for found in by_sequence if not same_pixels(*found)), [])
     overall = (
         {method: fmean(means[item, method] for item in complete) for method in methods} if complete else {}
     )
@@ -178,21 +192,25 @@ def _board(rows: Sequence[BoardRow], figure: Figure, profile: str) -> dict[str, 
         "methods": methods,
         "lines": lines,
         "complete": len(complete),
-        "means": _cells({method: overall.get(method) for method in methods}, figure, ceilings)
+        "means": _cells({method: overall.get(method) for method in methods}, figure, ceilings, apart)
         if overall
         else [],
     }
 
 
 def _cells(
-    values: Mapping[str, float | None], figure: Figure, ceilings: Collection[str]
+    values: Mapping[str, float | None],
+    figure: Figure,
+    ceilings: Collection[str],
+    shares: Sequence[float | None],
 ) -> list[dict[str, Any]]:
-    """Figures of a row by method; the best marked where there are several.
+    """Figures of a row by method; the best marked where there are several over the same `shares` of pixels.
 
     `ceilings` are methods whose scenes have seen the held-out frames: they are no competitors.
     """
     known = [value for method, value in values.items() if value is not None and method not in ceilings]
-    best = (max(known) if figure.higher_is_better else min(known)) if len(known) > 1 else None
+    comparable = len(known) > 1 and same_pixels(*shares)
+    best = (max(known) if figure.higher_is_better else min(known)) if comparable else None
     return [
         {
             "text": number(value, figure.digits),

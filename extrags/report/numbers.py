@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from extrags.metrics.registry import figures
+from extrags.metrics.registry import Metric, figures, metrics
 from extrags.report.downloads import Cell, csv_uri
 from extrags.report.inputs import ReportInputs
-from extrags.report.wording import compare, described_metrics, metric_of, number, shown_metrics
+from extrags.report.wording import (
+    Comparison,
+    compare,
+    described_metrics,
+    metric_of,
+    number,
+    same_pixels,
+    shown_metrics,
+    with_coverages,
+)
 
 __all__ = [
     "REGIONS",
@@ -22,6 +32,7 @@ __all__ = [
     "protocol",
     "regions",
     "summary",
+    "surface_rows",
     "tiles",
     "unobserved_shares",
 ]
@@ -32,6 +43,12 @@ REGIONS = (
     (("unobserved",), "Never observed"),
 )
 """Kinds of pixels: where their figures stand in a tree of metrics, and what they are called."""
+SURFACE_PARTS = (
+    (("surface",), "Observed by training"),
+    (("surface", "unobserved"), "Never observed"),
+    (("surface",), "All that a camera sees"),
+)
+"""Parts of the true surface, the same way; the coverage alone is of all of it."""
 _GROUP_LABELS = {
     "observed": "Observed pixels",
     "unobserved": "Unobserved pixels",
@@ -92,6 +109,7 @@ def tiles(inputs: ReportInputs) -> list[dict[str, Any]]:
                 metric_of(coarse, metric.key),
                 metric_of(final, metric.key),
                 _reason(inputs, metric.key),
+                _coverage(metric, coarse, final),
             ),
         }
         for metric in shown_metrics(coarse, final)
@@ -115,6 +133,7 @@ def regions(inputs: ReportInputs) -> list[dict[str, Any]]:
                     metric_of(coarse, *path, *alignment, metric.key),
                     metric_of(final, *path, *alignment, metric.key),
                     _reason(inputs, path[0] if path else metric.key),
+                    _coverage(metric, coarse, final, path),
                 )
                 for metric in shown_metrics(coarse, final)
             ]
@@ -129,12 +148,65 @@ def regions(inputs: ReportInputs) -> list[dict[str, Any]]:
     return rows
 
 
+def surface_rows(inputs: ReportInputs) -> dict[str, Any] | None:
+    """The table of the surface, `{metrics, unit, rows}`; None where neither scene has figures of it."""
+    coarse, final = metrics_of(inputs.coarse_metrics), metrics_of(inputs.final_metrics)
+    if not _has_surface(coarse, final):
+        return None
+    shown = [metric for metric in metrics("surface") if metric.shown.get("columns")]
+    rows = []
+    for path, label in SURFACE_PARTS:
+        of_all = label == SURFACE_PARTS[-1][1]
+        cells = [
+            _surface_comparison(metric, coarse, final, path) if (metric.key == "coverage") == of_all else None
+            for metric in shown
+        ]
+        rows.append({"label": label, "cells": cells})
+    return {"metrics": shown, "unit": "mm" if inputs.sequence.metric else "units", "rows": rows}
+
+
+def _surface_comparison(
+    metric: Metric, coarse: Mapping[str, Any] | None, final: Mapping[str, Any] | None, path: tuple[str, ...]
+) -> Comparison:
+    """A figure of the surface; accuracy is judged only where about as much of the true one was found."""
+    found = compare(metric, metric_of(coarse, *path, metric.key), metric_of(final, *path, metric.key))
+    before, after = (metric_of(tree, *path, "recall") for tree in (coarse, final))
+    if metric.key != "accuracy_mm" or before is None or after is None or same_pixels(before, after):
+        return found
+    said = f"over {'more' if after > before else 'less'} of the surface"
+    return replace(found, verdict="other pixels", coverage=said)
+
+
+def _has_surface(*trees: Mapping[str, Any] | None) -> bool:
+    return any(
+        metric_of(tree, *path, metric.key) is not None
+        for tree in trees
+        for path, _ in SURFACE_PARTS
+        for metric in metrics("surface")
+    )
+
+
+def _coverage(
+    metric: Metric,
+    coarse: Mapping[str, Any] | None,
+    final: Mapping[str, Any] | None,
+    path: tuple[str, ...] = (),
+) -> tuple[float | None, float | None]:
+    """Share of the pixels that a metric is over in both scenes; None for all of them."""
+    if not metric.coverage:
+        return None, None
+    return metric_of(coarse, *path, metric.coverage), metric_of(final, *path, metric.coverage)
+
+
 def missing_reasons(inputs: ReportInputs) -> list[tuple[str, str]]:
-    """Which figures there are not, and why."""
+    """Which figures the page has no value for, and why; of the surface only where there is a table of it."""
+    no_surface = not _has_surface(metrics_of(inputs.coarse_metrics), metrics_of(inputs.final_metrics))
     labels = {figure.name: figure.label for figure in figures()} | _GROUP_LABELS
     found: dict[str, str] = {}
     for result in (inputs.coarse_metrics, inputs.final_metrics):
         for key, reason in (result or {}).get("reasons", {}).items():
+            if no_surface and key.partition(".")[0] == "surface":
+                continue
             found.setdefault(labels.get(key, key), str(reason))
     return sorted(found.items())
 
@@ -143,7 +215,11 @@ def protocol(inputs: ReportInputs) -> dict[str, Any]:
     """Version of the protocol, and what its metrics are."""
     result = inputs.final_metrics or inputs.coarse_metrics or {}
     trees = (metrics_of(inputs.coarse_metrics), metrics_of(inputs.final_metrics))
-    return {"version": result.get("protocol"), "metrics": described_metrics(*trees)}
+    return {
+        "version": result.get("protocol"),
+        "metrics": described_metrics(*trees),
+        "surface": _has_surface(*trees),
+    }
 
 
 def _reason(inputs: ReportInputs, key: str) -> str:
@@ -190,7 +266,7 @@ def numbers_csv(inputs: ReportInputs) -> str:
     rows: list[list[Cell]] = []
     for path, label in REGIONS:
         for alignment, kind in (((), "plain"), (("aligned",), "exposure-aligned")):
-            for metric in shown_metrics(coarse, final):
+            for metric in with_coverages(shown_metrics(coarse, final)):
                 values = [metric_of(tree, *path, *alignment, metric.key) for tree in trees.values()]
                 if any(value is not None for value in values):
                     better = "higher" if metric.higher_is_better else "lower"

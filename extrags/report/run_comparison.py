@@ -24,7 +24,9 @@ from extrags.report.wording import (
     duration,
     metric_of,
     number,
+    same_pixels,
     shown_metrics,
+    with_coverages,
 )
 from extrags.sequence import EndoscopicSequence
 
@@ -112,7 +114,11 @@ def build_run_comparison(sequence: EndoscopicSequence, runs: Sequence[ComparedRu
         not_pictured=[run.name for run in runs[MOST_PICTURED:]],
         differing=differing,
         same=len(set().union(*(run.settings for run in runs))) - len(differing),
-        protocol={"version": runs[0].result.get("protocol"), "metrics": described_metrics(*trees)},
+        protocol={
+            "version": runs[0].result.get("protocol"),
+            "metrics": described_metrics(*trees),
+            "surface": False,
+        },
         protocols=sorted({str(run.result.get("protocol")) for run in runs}),
         compare_script=script_text("compare.js"),
     )
@@ -153,8 +159,12 @@ def _figures(runs: Sequence[ComparedRun], metrics: Sequence[Metric]) -> list[dic
     """Rows of the table, by kind of pixels and metric; one cell per run, held against the first."""
     rows = []
     for path, label in REGIONS:
-        for metric in metrics:
+        for metric in with_coverages(metrics):
             values = [metric_of(run.result["metrics"], *path, metric.key) for run in runs]
+            shares = [
+                metric_of(run.result["metrics"], *path, metric.coverage) if metric.coverage else None
+                for run in runs
+            ]
             if all(value is None for value in values):
                 continue
             known = [
@@ -163,6 +173,9 @@ def _figures(runs: Sequence[ComparedRun], metrics: Sequence[Metric]) -> list[dic
                 if value is not None and not run.held_out_trained_on
             ]
             best = max(known, default=None) if metric.higher_is_better else min(known, default=None)
+            rivals = [share for share, run in zip(shares, runs, strict=True) if not run.held_out_trained_on]
+            if not same_pixels(*rivals):
+                best = None
             rows.append(
                 {
                     "pixels": label,
@@ -173,7 +186,9 @@ def _figures(runs: Sequence[ComparedRun], metrics: Sequence[Metric]) -> list[dic
                             "best": len(known) > 1
                             and not run.held_out_trained_on
                             and _same(value, best, metric.digits),
-                            "change": compare(metric, values[0], value) if place else None,
+                            "change": compare(metric, values[0], value, coverage=(shares[0], shares[place]))
+                            if place
+                            else None,
                         }
                         for place, (value, run) in enumerate(zip(values, runs, strict=True))
                     ],
@@ -196,7 +211,7 @@ def _figures_csv(runs: Sequence[ComparedRun], metrics: Sequence[Metric]) -> str:
             *(metric_of(run.result["metrics"], *path, metric.key) for run in runs),
         ]
         for path, label in REGIONS
-        for metric in metrics
+        for metric in with_coverages(metrics)
     ]
     return csv_uri(["pixels", "metric", "unit", *(run.name for run in runs)], rows)
 

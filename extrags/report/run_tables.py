@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel
 
-from extrags.config import PipelineConfig
+from extrags.config import PROFILES, PipelineConfig
 from extrags.report.inputs import ReportInputs
+from extrags.report.measurements import measured_figure, measurement_rows
 from extrags.report.numbers import metrics_of
 from extrags.report.wording import count, duration, intrinsics_in_words, metric_of
 
@@ -21,6 +22,7 @@ __all__ = [
     "setting_groups",
     "stage_rows",
     "stage_summary",
+    "usual_settings",
 ]
 
 
@@ -58,15 +60,13 @@ def plan_rows(inputs: ReportInputs) -> dict[str, Any] | None:
     if inputs.plan is None:
         return None
     return {
-        "measurements": [
-            (name.replace("_", " "), _figure(value)) for name, value in inputs.plan["measurements"].items()
-        ],
+        "measurements": measurement_rows(inputs.plan["measurements"], metric=inputs.sequence.metric),
         "decisions": [
             {
                 "stage": line["stage"],
                 "run": line["run"],
-                "value": _figure(line["value"]),
-                "threshold": _figure(line["threshold"]),
+                "value": measured_figure(line["value"]),
+                "threshold": measured_figure(line["threshold"]),
                 "budget": [f"{key} = {value}" for key, value in line["budget"].items()],
                 "saves": "" if line.get("saves_s") is None else f"{line['saves_s']:.1f} s",
                 "reason": line["reason"],
@@ -123,11 +123,26 @@ def _spent(inputs: ReportInputs) -> float:
     return sum((float(row.get("seconds") or 0) for row in inputs.stages), 0.0)
 
 
-def setting_groups(config: PipelineConfig | None) -> list[dict[str, Any]]:
-    """All settings by stage, those that differ from the defaults marked."""
+def usual_settings(profile: str) -> tuple[str, PipelineConfig]:
+    """What a run's settings are held against, by its name: the profile it was run with, else the defaults.
+
+    Args:
+        profile: as pages have it: its name, and what else there is to say after a comma.
+    """
+    name = profile.partition(",")[0]
+    return (f"profile {name}", PROFILES[name]) if name in PROFILES else ("default", PipelineConfig())
+
+
+def setting_groups(config: PipelineConfig | None, profile: str) -> list[dict[str, Any]]:
+    """All settings by stage, those that differ from the profile's marked.
+
+    Args:
+        config: of the run.
+        profile: see `usual_settings`.
+    """
     if config is None:
         return []
-    defaults = PipelineConfig()
+    _, defaults = usual_settings(profile)
     groups = []
     for stage in type(config).model_fields:
         values, usual = (_group(whole, stage) for whole in (config, defaults))
@@ -162,11 +177,6 @@ def flat_settings(model: BaseModel, prefix: str = "") -> dict[str, Any]:
         else:
             found[prefix + name] = value
     return found
-
-
-def _figure(value: float | int) -> str:
-    """A measured number: whole ones as counts, others with four digits."""
-    return count(value) if float(value).is_integer() else f"{float(value):.4g}"
 
 
 def plain_value(value: Any) -> str:

@@ -85,12 +85,13 @@ def depth_rows(inputs: ReportInputs, views: int, largest_bytes: int) -> ImageTab
     }
     high = scale_end([error[np.isfinite(error)] for error in errors.values()])
 
-    rows = []
+    rows, holes = [], False
     for place, frame in enumerate(map(int, frames)):
         name = sequence.frame_name(frame)
         cells = []
         for label, depth in (*depths.items(), ("truth", np.where(known, truth, 0))):
             valid = (depth[place] > 0) & masks[place]
+            holes = holes or not bool(valid.all())
             shown = color_mapped(depth[place], near, far, colormap=DEPTH_COLORMAP, valid=valid)
             alt = f"Frame {name}, depth, {label}"
             cells.append(ImageCell(fitted_image(shown, largest_bytes), label.capitalize(), alt))
@@ -104,7 +105,7 @@ def depth_rows(inputs: ReportInputs, views: int, largest_bytes: int) -> ImageTab
         ColorScale(color_bar(DEPTH_COLORMAP), f"≤ {near:.3g}", f"≥ {far:.3g}", f"z-depth in {unit}"),
         error_scale(high, "relative error of the depth"),
     )
-    return ImageTable(tuple(rows), scales, len(rows), len(inputs.frames))
+    return ImageTable(tuple(rows), scales, len(rows), len(inputs.frames), masked=holes)
 
 
 def virtual_rows(

@@ -7,13 +7,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from extrags.metrics.registry import Metric, metrics
+from extrags.metrics.registry import Metric, metric_named, metrics
 from extrags.sequence import EndoscopicSequence
 
 __all__ = [
     "Comparison",
     "compare",
     "count",
+    "coverage_words",
     "described_metrics",
     "duration",
     "intrinsics_in_words",
@@ -21,14 +22,18 @@ __all__ = [
     "number",
     "percent",
     "restorer_words",
+    "same_pixels",
     "shown_metrics",
+    "with_coverages",
 ]
 
 MINUS = "\N{MINUS SIGN}"
 MISSING = "\N{EN DASH}"
 UNLIKE = 1.5
 """So many times the error that a restorer expects of itself in a scene unlike those it has learned from."""
-Verdict = Literal["better", "worse", "equal", ""]
+COVERAGE_APART = 0.01
+"""Figures over shares of the pixels that differ by more are over different pixels."""
+Verdict = Literal["better", "worse", "equal", "other pixels", ""]
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +46,8 @@ class Comparison:
     verdict: Verdict
     why: str = ""
     """Why there is no figure."""
+    coverage: str = ""
+    """Which share of the pixels the figures are over, in words; empty for all of them."""
 
 
 def number(value: float | int | None, digits: int, *, signed: bool = False) -> str:
@@ -65,9 +72,16 @@ def restorer_words(provenance: Mapping[str, Any]) -> str:
     judged = provenance.get("judged")
     if not judged:
         return said
+    restored, filled = (number(judged[name], 2) for name in ("restored_db", "filled_db"))
+    if provenance["backend"] == "classical":
+        loss = number(judged["filled_db"] - judged["restored_db"], 2)
+        return (
+            "Restored by blending and filling. The network was left out: on left-out frames of this scene "
+            f"it reaches {restored} dB, {loss} dB less than blending and filling with {filled} dB."
+        )
     said += (
-        f" On left-out frames of this scene the network reaches {number(judged['restored_db'], 2)} dB, "
-        f"blending and filling {number(judged['filled_db'], 2)} dB."
+        f" On left-out frames of this scene the network reaches {restored} dB, "
+        f"blending and filling {filled} dB."
     )
     ratio = judged.get("error_over_expected")
     if ratio is None:
@@ -126,14 +140,48 @@ def metric_of(tree: Mapping[str, Any] | None, *path: str) -> float | None:
     return None if node is None or isinstance(node, Mapping) else float(node)
 
 
+def same_pixels(*coverages: float | None) -> bool:
+    """Whether figures over these shares of the pixels can be held against each other."""
+    known = [coverage for coverage in coverages if coverage is not None]
+    return not known or max(known) - min(known) <= COVERAGE_APART
+
+
+def coverage_words(coarse: float | None, final: float | None = None) -> str:
+    """Which share of the pixels a figure is over: `over more pixels: coverage 94 % → 100 %`.
+
+    Empty where nothing is known.
+    """
+    shares = list(dict.fromkeys(percent(share) for share in (coarse, final) if share is not None))
+    if not shares:
+        return ""
+    said = f"coverage {' → '.join(shares)}"
+    if coarse is None or final is None or same_pixels(coarse, final):
+        return said
+    return f"over {'more' if final > coarse else 'fewer'} pixels: {said}"
+
+
 def compare(
-    metric: Metric, coarse: float | int | None, final: float | int | None, why: str = ""
+    metric: Metric,
+    coarse: float | int | None,
+    final: float | int | None,
+    why: str = "",
+    coverage: tuple[float | None, float | None] = (None, None),
 ) -> Comparison:
-    """A figure before and after, with the change in words that do not need colour."""
+    """A figure before and after, with the change in words that do not need colour.
+
+    Args:
+        metric: of the figure.
+        coarse: before.
+        final: after.
+        why: there is none.
+        coverage: share of the pixels that each is over; where they differ, neither figure is called better.
+    """
     change = None if coarse is None or final is None else final - coarse
     verdict: Verdict = ""
     if change is not None:
-        if round(change, metric.digits) == 0:
+        if not same_pixels(*coverage):
+            verdict = "other pixels"
+        elif round(change, metric.digits) == 0:
             verdict = "equal"
         else:
             verdict = "better" if (change > 0) == metric.higher_is_better else "worse"
@@ -144,6 +192,7 @@ def compare(
         number(change, metric.digits, signed=True),
         verdict,
         why if missing else "",
+        "" if missing else coverage_words(*coverage),
     )
 
 
@@ -156,6 +205,14 @@ def shown_metrics(*trees: Mapping[str, Any] | None) -> list[Metric]:
         # A network without weights keeps its column: its absence has a reason.
         and (metric.lpips_net is None or any(metric.key in (tree or {}) for tree in trees))
     ]
+
+
+def with_coverages(shown: Sequence[Metric]) -> list[Metric]:
+    """The metrics of a list, each that is over a part of the pixels followed by its coverage."""
+    found = []
+    for metric in shown:
+        found += [metric, *([metric_named(metric.coverage)] if metric.coverage else [])]
+    return found
 
 
 def described_metrics(*trees: Mapping[str, Any] | None) -> dict[str, str]:

@@ -41,6 +41,7 @@ class Run:
         keys: artefacts it made or found.
         interrupted: whether it was told to stop or was killed before its end; records of earlier versions do
             not tell.
+        config: digest of its settings; empty where it is not known.
     """
 
     name: str
@@ -48,13 +49,14 @@ class Run:
     ended: str
     keys: frozenset[str]
     interrupted: bool = False
+    config: str = ""
 
 
 class RunRecord:
     """The record of a run that is going on; see `recorded_run`."""
 
-    def __init__(self, store: Store, sequence: str) -> None:
-        self._store, self._sequence = store, sequence
+    def __init__(self, store: Store, sequence: str, config: str = "") -> None:
+        self._store, self._sequence, self._config = store, sequence, config
         self._keys: set[str] = set()
         self._guard = threading.Lock()
         self.interrupted = False
@@ -99,14 +101,21 @@ class RunRecord:
 
     def _content(self) -> dict[str, Any]:
         content = {"sequence": self._sequence, "ended": _now(), "keys": sorted(self._keys)}
+        content |= {"config": self._config} if self._config else {}
         return content | ({"interrupted": True} if self.interrupted else {})
 
 
 @contextmanager
-def recorded_run(store: Store, sequence: str) -> Iterator[RunRecord | None]:
-    """Record the run inside the block; None where the store cannot be written, as for who only looks."""
+def recorded_run(store: Store, sequence: str, config: str = "") -> Iterator[RunRecord | None]:
+    """Record the run inside the block; None where the store cannot be written, as for who only looks.
+
+    Args:
+        store: of its artefacts.
+        sequence: its display name.
+        config: digest of its settings; empty for none.
+    """
     try:
-        record = RunRecord(store, sequence)
+        record = RunRecord(store, sequence, config)
     except OSError as error:
         log.debug("no record of this run: %s", error)
         yield None
@@ -195,7 +204,8 @@ def _run(name: str, record: dict[str, Any]) -> Run | None:
     try:
         keys = frozenset(map(str, record["keys"]))
         interrupted = record.get("interrupted") is True
-        return Run(name, str(record["sequence"]), str(record["ended"]), keys, interrupted)
+        config = str(record.get("config", ""))
+        return Run(name, str(record["sequence"]), str(record["ended"]), keys, interrupted, config)
     except (KeyError, TypeError):
         return None
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import datetime
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from extrags import __version__
 from extrags.errors import ConfigError, StoreError
+from extrags.source_commit import source_commit
 from flows.commands.common import items, run_options, set_up_logging, store_root, without_folders
 from flows.commands.options import Parser, add_output, add_store
 
@@ -85,11 +88,19 @@ def gallery(given: argparse.Namespace) -> int:
             title=given.name,
             command=_commands([run.record for run in chosen if run.record is not None], given),
             largest_bytes=1000 * given.kb,
+            made=_made(),
         )
     except OSError as error:
         raise StoreError(f"the gallery cannot be written: {error}") from error
     print(page)
     return 0
+
+
+def _made() -> str:
+    """By what and when, so that a page can be told to be of an earlier version."""
+    commit = source_commit()
+    version = f"{__version__} ({commit[:9]})" if commit else __version__
+    return f"extrags {version} on {datetime.datetime.now(datetime.UTC):%Y-%m-%d}"
 
 
 def _commands(runs: Sequence[OutcomeRecord], given: argparse.Namespace) -> str:

@@ -67,6 +67,7 @@ def plan(given: argparse.Namespace) -> int:
     (outcome,) = execute([given.sequence], given, until="assess").sequences
     if outcome.status == "failed":
         raise outcome.error or ExtragsError(f"{outcome.name} failed")
+    from extrags.provenance import ARBITRARY_SCALE
     from extrags.run_costs import packaged_model
     from flows.console import print_plan
     from flows.run_costs import pace_here, planned_work, predict_run, unplanned_work
@@ -86,7 +87,8 @@ def plan(given: argparse.Namespace) -> int:
     smaller = at_detail_size(work, counts)
     reduced = None if smaller is None else cost(smaller, stages)
     if given.json != "-":
-        print_plan(outcome)
+        scale = store.manifest(outcome.refs["sequence"]).counts.get("scale")
+        print_plan(outcome, metric=scale != ARBITRARY_SCALE)
         print_prediction(predicted, whole)
         if reduced is not None:
             print_detail(str(counts["detail"]), detail_flags(config, counts), predicted, reduced)

@@ -401,6 +401,7 @@ def _from_store(
 
     They are left on record as those of a flow run are.
     """
+    from extrags.store import Store
     from flows.methods import METHODS, profile_label
     from flows.pages import dataset_page
     from flows.runners import NotInStoreError, StoreRunner
@@ -430,7 +431,10 @@ def _from_store(
                 outcome.seed = case.seed if several_seeds else None
                 outcomes.append(outcome)
             label = profile_label(cases[0].profile, ", ".join(dict.fromkeys(case.method for case in cases)))
-            page = dataset_page(outcomes, "dataset", label, runner) if until == "report" else None
+            page = None
+            if until == "report":
+                given = [case.settings for case in cases]
+                page = dataset_page(outcomes, given, "dataset", label, Store(root), runner)
     except (NotInStoreError, DamagedArtefactError):
         return None
     for case, outcome in zip(cases, outcomes, strict=True):

@@ -19,6 +19,7 @@ from flows.limits import StageLimits
 from flows.outcome import SequenceOutcome
 from flows.runners import DirectRunner
 from flows.tables import difference_text, spread_text
+from tests.extrags.report.pages import Page
 from tests.flows.damaging import flip_bit
 from tests.flows.tiny import SEQUENCE, TINY
 
@@ -77,6 +78,21 @@ class TestRuns:
         assert [run["method"] for run in per_view[:2]] == ["3dgs", "coarse"]
         assert case["metrics"]["surface"]["threshold_mm"] == 1.0
         assert evaluation["true_surface"] == "mesh"
+
+    def test_settings_and_image_size_are_on_the_page_and_in_its_files(
+        self, found: dict[str, Any], finished: tuple[str, SequenceOutcome]
+    ) -> None:
+        case, report = found["cases"][0], Path(found["report"])
+        assert case["settings"]["coarse.iterations"] == 60
+        width, height = case["image_size"]
+        text = Page(report.read_text()).text
+        assert f"Image size {width} × {height} px" in text  # noqa: RUF001
+        assert "ingest.max_frames = 10" in text
+        assert found["methods"]["no-light"] == "coarse with coarse.light.enabled = False"
+        (manifest,) = Store(finished[0]).ls(report.parent.name)
+        assert manifest.config["runs"][0]["settings"]["ingest.max_frames"] == 10
+        per_view = json.loads((report.parent / "per_view.json").read_text())
+        assert per_view[0]["image_size"] == [width, height]
 
     def test_methods_are_compared_in_pairs(self, found: dict[str, Any]) -> None:
         comparison = found["comparison"]

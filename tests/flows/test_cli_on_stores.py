@@ -89,6 +89,10 @@ class TestFinished:
         assert "% of the pixels" in said
         assert "saves s" in said
         assert "without the plan" in " ".join(said.split())
+        measured = said.split("measured")[1].splitlines()
+        depth = next(line for line in measured if "Median depth of the training views" in line)
+        assert depth.rstrip().endswith(" mm")
+        assert not any("e+0" in line or "_" in line for line in measured)
 
     def test_plan_as_json(
         self, finished: tuple[str, SequenceOutcome], capsys: pytest.CaptureFixture[str]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 from extrags.store import Ref, Store
 from extrags.store.retention import Policy, planned_removals
@@ -14,13 +15,24 @@ from tasks.report import PAGE
 from tests.extrags.report.pages import Page
 
 
+def page_of(
+    outcomes: list[SequenceOutcome],
+    store: Store,
+    settings: list[dict[str, Any]] | None = None,
+    name: str = "dataset",
+) -> Page:
+    given = settings or [{} for _ in outcomes]
+    place = dataset_page(outcomes, given, name, "quick", store, DirectRunner(store.root))
+    return Page(Path(place).read_text())
+
+
 def test_several_seeds_have_a_table_of_their_spread(tmp_path: Path) -> None:
     outcomes = [
         SequenceOutcome("phantom/0@sparse", variant=f"{method}, seed {seed}", seed=seed)
         for method in ("3dgs", "extrags")
         for seed in (0, 1)
     ]
-    page = Page(Path(dataset_page(outcomes, "seeds", "quick", DirectRunner(str(tmp_path)))).read_text())
+    page = page_of(outcomes, Store(tmp_path), name="seeds")
     assert "phantom/0@sparse, seed 1 [3dgs]" in page.text
     spread = page.text.split("Spread over seeds")[1]
     assert "phantom/0@sparse [3dgs] 2" in spread
@@ -35,7 +47,7 @@ def test_it_links_the_pages_of_this_run_and_keeps_them(tmp_path: Path) -> None:
         return SequenceOutcome("phantom/0@sparse", refs={"report": ref}, report=f"{ref.uri}/{PAGE}")
 
     first, second = (
-        Path(dataset_page([outcome(views)], "dataset", "quick", DirectRunner(store.root)))
+        Path(dataset_page([outcome(views)], [{}], "dataset", "quick", store, DirectRunner(store.root)))
         for views in ("one", "three")
     )
     assert first != second
@@ -58,3 +70,17 @@ def report(store: Store, views: str) -> Ref:
     with store.slot(stage="report", version=12, key=f"report-v12-{views}", label="phantom/0@sparse") as slot:
         (slot.path / PAGE).write_text(views)
     return slot.ref
+
+
+def test_settings_that_were_given_are_told_and_are_in_the_manifest(tmp_path: Path) -> None:
+    outcomes = [SequenceOutcome(f"phantom/{number}@sparse") for number in (0, 1)]
+    store = Store(tmp_path)
+    shared = {"coarse.iterations": 300, "ingest.width": 80}
+    text = page_of(outcomes, store, [shared, shared]).text
+    assert "Settings given coarse.iterations = 300, ingest.width = 80" in text
+    (manifest,) = store.ls("dataset-report")
+    assert manifest.config["settings"] == [shared, shared]
+
+    text = page_of(outcomes, store, [shared, {}]).text
+    assert "phantom/0@sparse: coarse.iterations = 300, ingest.width = 80" in text
+    assert "phantom/1@sparse: none beside the profile" in text

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 import shutil
 from dataclasses import replace
@@ -11,6 +12,7 @@ from typing import Any
 import pytest
 
 from data_catalog.catalog import describe
+from extrags import __version__
 from extrags.errors import ConfigError, StoreError
 from extrags.pipeline import HELD_OUT_TRAINED_ON
 from extrags.sequence import EndoscopicSequence
@@ -192,6 +194,9 @@ def test_gallery_from_the_command_line(
     assert str(tmp_path) not in text
     assert "Virtual view" in text
     assert f"Pictures derive from: {describe(SEQUENCE).description}. Licence: Apache-2.0 (generated)." in text
+    said = re.search(r"Made by extrags (\S+)( \([0-9a-f]{9}\))? on (\d{4}-\d\d-\d\d)\n", text)
+    assert said is not None
+    assert said[1] == __version__
 
 
 def test_the_command_of_a_gallery_has_its_options(store: Store, tmp_path: Path) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -11,12 +13,14 @@ from rich.console import Console
 
 from extrags.errors import UnknownSequenceError
 from extrags.pipeline import STAGES
-from extrags.store import Store
+from extrags.store import Store, digest_of
 from extrags.store.runs import recorded_run
 from flows.cases import SequenceCase, record_outcome
 from flows.cli import main
 from flows.outcome import SequenceOutcome, StageRow
+from flows.runners import DirectRunner
 from flows.store_status import StageStatus, StatusRow, StoreStatus, store_status
+from flows.wiring import run_sequence
 from tests.flows.tiny import GIVEN, SEQUENCE, TINY, tiny_config
 
 CASE = SequenceCase(SEQUENCE, profile="quick", settings=TINY)
@@ -107,6 +111,50 @@ def test_a_first_run_that_was_interrupted(store: Store, finished: tuple[str, Seq
         "missing",
     )
     assert main(["status", "--store", store.root]) == 0
+
+
+def test_a_run_with_other_settings_is_not_the_one_on_record(
+    store: Store, finished: tuple[str, SequenceOutcome]
+) -> None:
+    keys = {key for row in finished[1].stages if row.stage == "ingest" for key in row.made}
+    with (
+        recorded_run(store, SEQUENCE, "other") as record,
+        store.slot(stage="coarse", version=1, key="coarse-v1-other", label=SEQUENCE),
+    ):
+        assert record is not None
+        record.add(keys)
+        other, done = store_status(store).rows
+    assert (done.variant, done.state, done.stages["coarse"].state) == ("quick", "done", "done")
+    assert (other.variant, other.state) == ("other settings", "running")
+    assert [other.stages[stage].state for stage in ("ingest", "coarse")] == ["done", "running"]
+    with (
+        recorded_run(store, SEQUENCE, digest_of(tiny_config())),
+        store.slot(stage="coarse", version=1, key="coarse-v1-again", label=SEQUENCE),
+    ):
+        (row,) = store_status(store).rows
+    assert (row.state, row.stages["coarse"].state) == ("running", "running")
+
+
+def test_a_run_notes_the_settings_that_its_record_will_have(
+    finished: tuple[str, SequenceOutcome], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    noted: list[str] = []
+
+    @contextmanager
+    def noting(store: Store, sequence: str, config: str) -> Iterator[None]:
+        noted.append(config)
+        yield None
+
+    monkeypatch.setattr("flows.cached_stages.recorded_run", noting)
+    root, config = finished[0], CASE.config()
+    run_sequence(SEQUENCE, config, root, DirectRunner(root), profile="quick", until="ingest")
+    assert noted == [digest_of(config)]
+
+
+@pytest.mark.parametrize("stage", ["benchmark-report", "dataset-report"])
+def test_a_page_of_several_sequences_is_no_sequence(store: Store, stage: str) -> None:
+    with store.slot(stage=stage, version=1, key=f"{stage}-v1-x", label="benchmark"):
+        assert [row.sequence for row in store_status(store).rows] == [SEQUENCE]
 
 
 def test_frames_for_a_later_stage_do_not_make_it_done(

@@ -19,9 +19,10 @@ from extrags.illumination import NearFieldLight
 from extrags.raster.rendering import ALPHA_MIN, DILATION_PX2
 from extrags.report.inputs import MeshLike, ReportInputs
 from extrags.report.space import HELD_OUT_COLOR, clustered, trajectory_colors
-from extrags.report.viewer.encoding import BLOCK, EncodedScene, Quantity, encoded_scene
+from extrags.report.viewer.encoding import BLOCK, EncodedScene, Quantity, encoded_scene, faint_gaussians
 from extrags.report.viewer.free_space import encoded_free_space
 from extrags.report.viewer.quantities import scene_quantities
+from extrags.report.wording import count as in_words
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
 
@@ -47,6 +48,7 @@ class ViewerContent:
         sorter: the program of the worker.
         bodies: encoded scenes by element, base64.
         scenes: `{name, title, count, said}` of each, for the words round the canvas.
+        left_out: how many Gaussians are left out for showing in no picture, in words; empty for none.
         has_mesh: whether a surface is among the overlays.
         has_virtual: whether there are virtual trajectories.
         has_free_space: whether the free space of the run is among the overlays.
@@ -61,6 +63,7 @@ class ViewerContent:
     sorter: Markup
     bodies: Mapping[str, Markup]
     scenes: Sequence[Mapping[str, Any]]
+    left_out: str
     has_mesh: bool
     has_virtual: bool
     has_free_space: bool
@@ -131,6 +134,7 @@ def viewer_content(inputs: ReportInputs, largest_bytes: int) -> ViewerContent | 
         sorter=script_text(SORTER),
         bodies=bodies,
         scenes=words,
+        left_out=_left_out(scenes),
         has_mesh=data["mesh"] is not None,
         has_virtual=bool(inputs.trajectories),
         has_free_space=data["free"] is not None,
@@ -153,6 +157,18 @@ def viewer_section(inputs: ReportInputs, config: ReportConfig) -> dict[str, Any]
     else:
         absent = inputs.why_absent("coarse_scene", "coarse")
     return {"viewer": content, "viewer_absent": absent, "viewer_script": script_text(*SCRIPTS)}
+
+
+def _left_out(scenes: Mapping[str, Scene]) -> str:
+    """How many Gaussians of each scene show in no picture."""
+    found = [
+        f"{in_words(faint)} of {in_words(len(scene.gaussians))} in the {name} scene"
+        for name, scene in scenes.items()
+        if (faint := faint_gaussians(scene.gaussians))
+    ]
+    if not found:
+        return ""
+    return f"Gaussians too transparent to show in any picture (below 1/255) are left out: {', '.join(found)}."
 
 
 def encoded_within(

@@ -25,7 +25,7 @@ from extrags.errors import ShapeError, SourceError
 from extrags.gaussians import Gaussians
 from extrags.raster.rendering import ALPHA_MIN
 
-__all__ = ["EncodedScene", "Quantity", "decoded_scene", "encoded_scene"]
+__all__ = ["EncodedScene", "Quantity", "decoded_scene", "encoded_scene", "faint_gaussians"]
 
 BLOCK = 256
 """Gaussians that share the range of each channel."""
@@ -111,6 +111,11 @@ def encoded_scene(
     # Without the time of day: equal scenes give equal bytes.
     body = gzip.compress(b"".join(planes), COMPRESSION, mtime=0)
     return EncodedScene(body, len(order), kept, tuple(quantities))
+
+
+def faint_gaussians(gaussians: Gaussians) -> int:
+    """How many no picture shows (opacity below 1/255): `encoded_scene` leaves them out."""
+    return int((gaussians.opacities.detach().sigmoid() < ALPHA_MIN).sum())
 
 
 def decoded_scene(encoded: EncodedScene) -> tuple[Gaussians, dict[str, UInt8[np.ndarray, "n"]]]:

@@ -197,3 +197,26 @@ def test_colours_of_methods() -> None:
     colors = method_colors(["a", "base", "b"], "base")
     assert list(colors) == ["base", "a", "b"]
     assert len(set(colors.values())) == 3
+
+
+def test_stages_that_runs_share_took_their_time_once(inputs: BenchmarkInputs) -> None:
+    stages = [{"artefacts": ["ingest-0"], "made_seconds": 20.0}, {"artefacts": [], "made_seconds": 0.0}]
+    runs = [{**run, "seconds": 50.0, "stages": stages} for run in inputs.runs[:2]]
+    assert "Run time of all 1 min 20 s" in Page(build_benchmark_report(replace(inputs, runs=runs))).text
+
+
+def test_depth_over_different_pixels_is_not_judged() -> None:
+    def page_of(coverage: float) -> Page:
+        runs = runs_of({"phantom/0": 1.0}, seeds=2)
+        for item in runs:
+            fuller = item["method"] == "coarse"
+            item["metrics"] |= {
+                "depth_absrel": 0.04 if fuller else 0.03,
+                "depth_coverage": 1.0 if fuller else coverage,
+            }
+        return Page(build_benchmark_report(BenchmarkInputs("depth", runs, "3dgs", METHODS)))
+
+    differences = page_of(0.9).text.split("Differences to 3dgs")[1].split("By sequence")[0]
+    assert "Depth AbsRel ↓ +0.010 over more pixels: see the coverage" in differences
+    assert "Depth coverage ↑ +0.100 better" in differences
+    assert "Depth AbsRel ↓ +0.010 worse" in page_of(1.0).text

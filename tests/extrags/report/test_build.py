@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from extrags.config import ReportConfig
+from extrags.config import ReportConfig, profile_config
 from extrags.errors import NonFiniteError, ShapeError
 from extrags.metrics.registry import Metric, register_metric, unregister_metric
 from extrags.report import ReportInputs, build_report
@@ -84,8 +84,27 @@ def test_numbers_and_changes_are_on_the_page(page: Page) -> None:
     assert "1 min 05 s in all: 1 ran, 1 came from the cache, 1 skipped." in page.text
     assert "The cache spared 5.0 s" in page.text
     assert "the source has poses" in page.text
-    assert "iterations 777 default 3000" in page.text
+    assert "iterations 777 profile quick: 1500" in page.text
     assert "on the network AlexNet" in page.text
+
+
+@pytest.mark.parametrize(
+    ("profile", "differs"),
+    [
+        ("quick", None),
+        ("quick, method 3dgs", None),
+        ("balanced", "profile balanced: 5000"),
+        ("", "default: 3000"),
+        ("mine", "default: 3000"),
+    ],
+)
+def test_settings_are_held_against_the_profile_of_the_run(
+    inputs: ReportInputs, profile: str, differs: str | None
+) -> None:
+    quick = replace(inputs, config=profile_config("quick"), profile=profile)
+    text = Page(build_report(quick, CONFIG)).text.split("Settings and environment")[1]
+    assert ("profile quick:" in text or "default:" in text or "profile balanced:" in text) == bool(differs)
+    assert differs is None or f"iterations 1500 {differs}" in text
 
 
 def test_a_loss_is_called_a_loss(inputs: ReportInputs) -> None:
@@ -120,11 +139,17 @@ def test_how_the_restorer_was_judged_is_told(inputs: ReportInputs, html: str) ->
     assert inputs.pseudo is not None
     judged = {"restored_db": 20.0, "filled_db": 26.0, "error_over_expected": 2.5}
     for provenance, words in (
-        ({"backend": "classical", "judged": judged}, "is unlike those it has learned from"),
+        ({"backend": "embedded", "judged": judged}, "is unlike those it has learned from"),
+        (
+            {"backend": "classical", "judged": judged},
+            "The network was left out: on left-out frames of this scene it reaches 20.00 dB, 6.00 dB less",
+        ),
         ({"backend": "classical"}, "Restored by classical."),
     ):
         pseudo = replace(inputs.pseudo, provenance=provenance)
-        assert words in build_report(replace(inputs, pseudo=pseudo), ReportConfig())
+        html = build_report(replace(inputs, pseudo=pseudo), ReportConfig())
+        assert words in html
+        assert ("it has learned from" in html) == (provenance["backend"] == "embedded")
 
 
 def test_what_the_plan_left_out_is_named_with_its_reason(inputs: ReportInputs) -> None:
@@ -144,6 +169,17 @@ def test_what_the_plan_left_out_is_named_with_its_reason(inputs: ReportInputs) -
         assert f"The scene plan leaves out {stage}: no need for {stage}." in page.text
     assert "There is no fine-tuned scene to compare with." in page.text
     assert not any("final render" in str(image["alt"]) for image in page.images)
+
+
+def test_measurements_of_the_plan_have_words_and_units(inputs: ReportInputs) -> None:
+    measured = {"hole_share": 0.124, "gaussians": 14012.0, "depth_unit_mm": 1.688, "further_one": 0.5}
+    plan = {**inputs.plan, "measurements": measured}
+    text = Page(build_report(replace(inputs, plan=plan), CONFIG)).text
+    assert "Holes in nearby views 12.40 %" in text
+    assert "Median depth of the training views 1.688 mm" in text
+    assert "further one 0.5" in text
+    scaleless = replace(inputs, plan=plan, sequence=replace(inputs.sequence, metric=False))
+    assert "training views 1.688 units of the scene" in Page(build_report(scaleless, CONFIG)).text
 
 
 def test_bare_inputs_name_every_absent_part(inputs: ReportInputs) -> None:
@@ -180,15 +216,47 @@ def test_what_there_is_not_is_called_what_it_is(inputs: ReportInputs) -> None:
     result = result_of(20.0, 10)
     result["reasons"] = {
         "n_gaussians": "the renders are not of Gaussians",
-        "surface": "the sequence has no true depth",
-        "surface.accuracy_mm": "the scene has no surface",
         "unobserved": "no view has any",
     }
     text = Page(build_report(replace(inputs, coarse_metrics=result, final_metrics=result), CONFIG)).text
     assert "Number of Gaussians: not available, the renders are not of Gaussians." in text
-    assert "Figures of the surface: not available, the sequence has no true depth." in text
-    assert "Surface accuracy: not available, the scene has no surface." in text
     assert "Unobserved pixels: not available, no view has any." in text
+
+
+def test_the_surface_has_a_table_where_there_are_figures_of_it(inputs: ReportInputs) -> None:
+    def told(psnr: float, accuracy_mm: float | None, coverage: float) -> dict[str, object]:
+        result = result_of(psnr, 1000)
+        unobserved = {"accuracy_mm": psnr, "completeness_mm": None, "fscore": 0.1, "recall": coverage}
+        result["metrics"]["surface"] = {
+            "accuracy_mm": accuracy_mm,
+            "completeness_mm": 0.8,
+            "fscore": 0.7,
+            "coverage": coverage,
+            "unobserved": unobserved,
+        }
+        return result
+
+    both = replace(inputs, coarse_metrics=told(20.0, 0.9, 0.6), final_metrics=told(22.0, 0.7, 0.65))
+    text = Page(build_report(both, CONFIG)).text
+    assert "Observed by training 0.90 → 0.70 −0.20 better 0.80 → 0.80 ±0.00" in text  # noqa: RUF001
+    # Where there was next to no surface, what there was lay near the true one.
+    assert "Never observed 20.00 → 22.00 +2.00 over more of the surface" in text
+    assert "All that a camera sees 0.600 → 0.650 +0.050 better" in text
+    assert "fused into a mesh in the same way for every method" in text
+
+    lacking = told(22.0, None, 0.65)
+    lacking["reasons"] = {"surface.accuracy_mm": "the scene has no surface"}
+    text = Page(build_report(replace(both, final_metrics=lacking), CONFIG)).text
+    assert "Surface accuracy: not available, the scene has no surface." in text
+
+
+def test_a_page_without_figures_of_the_surface_does_not_speak_of_it(inputs: ReportInputs) -> None:
+    result = result_of(20.0, 10)
+    result["reasons"] = {"surface": "the sequence has no true depth"}
+    text = Page(build_report(replace(inputs, coarse_metrics=result, final_metrics=result), CONFIG)).text
+    assert "The surface" not in text
+    assert "no true depth" not in text
+    assert "fused into a mesh" not in text
 
 
 def test_a_metric_of_colours_is_aligned_whatever_it_is_called(inputs: ReportInputs) -> None:
@@ -219,6 +287,40 @@ def test_frames_that_left_for_want_of_a_pose_are_told(inputs: ReportInputs, page
     assert "the 3 without a pose are not among them" in told.text
     assert f"Training frames {len(inputs.sequence.train)} Held-out" in told.text
     assert "without a pose" not in page.text
+
+
+def test_counts_of_virtual_views_agree(inputs: ReportInputs, page: Page) -> None:
+    # Two trajectories of seven poses, of which the first is a real one.
+    assert "Virtual views 12 Coverage before" in page.text
+    assert "b_000 6 " in page.text
+    assert "b_003 6 " in page.text
+    assert "enhance.max_views" not in page.text
+    more = {**inputs.exploration, "virtual_views": 14}
+    text = Page(build_report(replace(inputs, exploration=more), CONFIG)).text
+    assert "The exploration found 14 views; 12 of them were restored" in text
+
+
+def test_charts_say_what_they_draw(inputs: ReportInputs, page: Page) -> None:
+    def said(page: Page) -> str:
+        return next(str(image["alt"]) for image in page.images if "PSNR of every" in str(image["alt"]))
+
+    scenes = "PSNR of every held-out view in the coarse and the final scene"
+    assert said(page) == f"{scenes}, and the gain against the share of pixels that training never saw"
+    alone = replace(inputs, final=None, final_metrics=None)
+    assert said(Page(build_report(alone, CONFIG))) == "PSNR of every held-out view in the coarse scene"
+    views = [{**view, "unobserved": {}} for view in inputs.coarse_metrics["per_view"]]
+    blind = {**inputs.coarse_metrics, "per_view": views}
+    told = build_report(replace(inputs, coarse_metrics=blind, final_metrics=blind), CONFIG)
+    assert said(Page(told)) == scenes
+
+
+def test_holes_of_the_depth_are_explained(inputs: ReportInputs, page: Page) -> None:
+    explained = "Light grey is where a scene has a hole"
+    assert explained not in page.text
+    alpha = inputs.coarse.alpha.copy()
+    alpha[:, :5] = 0
+    holes = replace(inputs.coarse, alpha=alpha)
+    assert explained in Page(build_report(replace(inputs, coarse=holes), CONFIG)).text
 
 
 def test_names_are_escaped(inputs: ReportInputs) -> None:
@@ -339,3 +441,18 @@ def test_intrinsics_that_nobody_stated_are_told(
     assert said in told
     assert ("degrees), not determined" in told) == (intrinsics == "guessed")
     assert "Focal length" not in html
+
+
+def test_coverage_of_the_depth_stands_beside_its_error(inputs: ReportInputs) -> None:
+    def told(result: dict[str, object], error: float, coverage: float) -> dict[str, object]:
+        depth = {"depth_absrel": error, "depth_coverage": coverage}
+        return {**result, "metrics": {**result["metrics"], **depth}}  # type: ignore[dict-item]
+
+    fuller = replace(
+        inputs,
+        coarse_metrics=told(result_of(20.0, 1000), 0.03, 0.49),
+        final_metrics=told(result_of(22.5, 1500), 0.05, 1.0),
+    )
+    text = Page(build_report(fuller, CONFIG)).text
+    assert "+0.020 from 0.030 over more pixels: coverage 49 % → 100 %" in text
+    assert "+0.020 worse" not in text

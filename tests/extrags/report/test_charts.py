@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from extrags.report import ReportInputs
+from extrags.report.chart_labels import LONGEST_LABEL, row_labels
 from extrags.report.charts import (
     COARSE_COLOR,
     FINAL_COLOR,
@@ -111,3 +112,31 @@ def test_names_may_be_long_and_have_any_letters() -> None:
     values = np.array([20.0, 21.0, 22.0])
     chart = sequences_chart(["a" * 150, "cost$_$x", "b_{$"], values, values + 1, values)
     assert [line.split(",")[0] for line in numbers(chart)] == ["a" * 150, "cost$_$x", "b_{$"]
+
+
+class TestLabelsOfRows:
+    def test_what_runs_differ_in_is_kept(self) -> None:
+        names = [f"phantom/11@sparse, seed {seed} [coarse.iterations=150]" for seed in (0, 1)]
+        assert row_labels(names) == [
+            "phantom/11@sparse, seed 0 [coarse…ns=150]",
+            "phantom/11@sparse, seed 1 [coarse…ns=150]",
+        ]
+
+    @pytest.mark.parametrize(
+        "names",
+        [
+            [f"{'a' * 60}{middle * 50}{'z' * 60}" for middle in "mno"],
+            [f"{'a' * 60}{'x' * number}" for number in range(4)],
+            [f"{'a' * 30}{'m' * 40}{letter}{'m' * 40}{'z' * 30}" for letter in "pqr"],
+            [f"{'a' * 70} (2)", "a" * 74, f"{'a' * 73}b"],
+            ["short", "x" * 41, "x" * 42, "x" * 43],
+        ],
+    )
+    def test_different_names_have_different_labels(self, names: list[str]) -> None:
+        labels = row_labels(names)
+        assert len(set(labels)) == len(names)
+        assert max(map(len, labels)) <= LONGEST_LABEL
+
+    def test_short_names_stay_and_equal_ones_are_equal(self) -> None:
+        assert row_labels(["a", "b", "a"]) == ["a", "b", "a"]
+        assert row_labels(["x" * 100] * 2) == [f"{'x' * 20}…{'x' * 20}"] * 2

@@ -12,6 +12,7 @@ from PIL import Image
 
 from extrags.errors import ConfigError
 from extrags.report import ReportInputs
+from extrags.report.encode import UNSEEN_RGB
 from extrags.report.gallery import GalleryRun, build_gallery
 
 
@@ -67,8 +68,16 @@ def test_source_and_licence_stand_beside_the_pictures(run: GalleryRun, tmp_path:
 def test_what_no_frame_saw_is_tinted(run: GalleryRun, tmp_path: Path) -> None:
     built([run], tmp_path)
     shown = np.asarray(Image.open(tmp_path / "000_tube_0_sparse_view_4.png")).astype(int)
-    tinted = shown[..., 0] > shown[..., 2] + 20
+    tinted = shown[..., 2] > shown[..., 0] + 20
     assert (tinted == ~run.sequence.observed[8]).all()
+
+
+def test_never_observed_has_one_colour_in_gallery_and_reports(run: GalleryRun, tmp_path: Path) -> None:
+    text = built([run], tmp_path)
+    assert "Cyan in *never observed*" in text
+    brightest = np.asarray(Image.open(tmp_path / "000_tube_0_sparse_view_4.png")).astype(int)
+    tint = brightest[~run.sequence.observed[8]].astype(float)
+    assert np.allclose(tint / tint[:, 2:], np.array(UNSEEN_RGB) / UNSEEN_RGB[2], atol=0.02)
 
 
 def test_runs_of_one_name_have_pictures_of_their_own(run: GalleryRun, tmp_path: Path) -> None:

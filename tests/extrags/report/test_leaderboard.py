@@ -120,3 +120,17 @@ def test_what_has_seen_the_views_is_never_the_best() -> None:
     page = Page(build_leaderboard([row("phantom/0@sparse", "extrags", 25.0), seen]))
     assert "Held-out frames were trained on in oracle, which is never marked as best" in page.text
     assert "30.00 best" not in page.text
+
+
+def test_no_error_of_depth_is_the_best_over_other_pixels() -> None:
+    def covered(method: str, error: float, coverage: float) -> BoardRow:
+        metrics = metrics_of(20.0) | {"depth_absrel": error, "depth_coverage": coverage}
+        return replace(row("phantom/1", method, 20.0), metrics=metrics)
+
+    def depth_board(coverage: float) -> str:
+        html = build_leaderboard([covered("3dgs", 0.03, coverage), covered("extrags", 0.04, 1.0)])
+        boards = html.split('<div class="board"')[1:]
+        return next(board for board in boards if 'data-figure="depth_absrel"' in board)
+
+    assert "best" in depth_board(1.0)
+    assert "best" not in depth_board(0.9)

@@ -224,3 +224,32 @@ def test_dataset_page_of_nothing_but_failures() -> None:
     page = Page(build_dataset_report([DatasetRow("a", "failed", 1.0, error="no frames")]))
     assert "None of them has both a coarse and a final figure to compare." in page.text
     assert Page(build_dataset_report([])).text.count("The run held no sequences.") == 1
+
+
+def test_errors_over_different_pixels_are_not_judged() -> None:
+    absrel = metric_named("depth_absrel")
+    filled = compare(absrel, 0.030, 0.041, coverage=(0.94, 1.0))
+    assert filled.verdict == "other pixels"
+    assert filled.change == "+0.011"
+    thin = "\N{NARROW NO-BREAK SPACE}"
+    assert filled.coverage == f"over more pixels: coverage 94{thin}% → 100{thin}%"
+    assert compare(absrel, 0.03, 0.02, coverage=(1.0, 0.9)).coverage.startswith("over fewer pixels")
+    alike = compare(absrel, 0.030, 0.041, coverage=(0.991, 0.9999))
+    assert alike.verdict == "worse"
+    assert alike.coverage == f"coverage 99{thin}% → 100{thin}%"
+    assert compare(absrel, 0.030, 0.041).coverage == ""
+
+
+def test_dataset_page_does_not_judge_depth_over_different_pixels() -> None:
+    def covered(name: str, before: float, after: float) -> DatasetRow:
+        coarse, final = metrics_of(20.0), metrics_of(21.0)
+        coarse |= {"depth_absrel": 0.030, "depth_coverage": before}
+        final |= {"depth_absrel": 0.041, "depth_coverage": after}
+        return DatasetRow(name, "completed", 60.0, coarse, final)
+
+    text = Page(build_dataset_report([covered("a", 0.9, 1.0), covered("b", 0.8, 1.0)])).text
+    assert "+0.011 worse" not in text
+    assert "over more pixels: coverage 90" in text
+    assert "+0.011 worse" in Page(build_dataset_report([covered("a", 1.0, 1.0)])).text
+    means = text.split("± between them")[1]
+    assert "over more pixels: coverage 85" in means

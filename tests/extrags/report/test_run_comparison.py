@@ -128,3 +128,19 @@ def test_a_run_that_has_seen_the_views_is_no_competitor(
     assert "Held-out frames were trained on in oracle" in text
     assert "The highest PSNR is that of 3dgs, 20.00 dB." in text
     assert "22.50 best" not in text
+
+
+def test_no_error_of_depth_is_the_best_over_other_pixels(
+    inputs: ReportInputs, runs: list[ComparedRun]
+) -> None:
+    def text_of(coverage: float) -> str:
+        told = []
+        for run, error, share in zip(runs, (0.03, 0.04), (coverage, 1.0), strict=True):
+            metrics = {**run.result["metrics"], "depth_absrel": error, "depth_coverage": share}
+            told.append(replace(run, result={**run.result, "metrics": metrics}))
+        return Page(build_run_comparison(inputs.sequence, told, views=1)).text
+
+    assert "Depth AbsRel ↓ 0.030 best +0.010 worse 0.040" in text_of(1.0)
+    other = text_of(0.9)
+    assert "Depth AbsRel ↓ 0.030 +0.010 over other pixels 0.040" in other
+    assert "Depth coverage ↑ 0.900 +0.100 better 1.000 best" in other

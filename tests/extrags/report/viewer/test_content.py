@@ -124,9 +124,21 @@ def test_left_out_where_there_are_no_gaussians(drawn: ReportInputs) -> None:
     assert "Nothing from the stage coarse" not in text
 
 
+def test_gaussians_that_show_in_no_picture_are_counted(drawn: ReportInputs) -> None:
+    gaussians = drawn.coarse_scene.gaussians
+    opacities = gaussians.opacities.clone()
+    opacities[:10] = -9.0
+    faint = Scene(replace(gaussians, opacities=opacities))
+    text = Page(build_report(replace(drawn, coarse_scene=faint), CONFIG)).text
+    assert f"are left out: 10 of {len(gaussians):,} in the coarse scene".replace(",", " ") in text
+    assert "too transparent" not in Page(build_report(drawn, CONFIG)).text
+
+
 def test_a_scene_without_light(drawn: ReportInputs) -> None:
+    assert "with the light at the camera" in build_report(drawn, CONFIG)
     unlit = replace(drawn, final_scene=None, coarse_scene=Scene(drawn.coarse_scene.gaussians))
     html = build_report(unlit, CONFIG)
+    assert "with the light at the camera" not in html
     assert 'data-light="exposure"' not in html
     data = json.loads(re.search(r'id="viewer-data">(.*?)</script>', html)[1])
     assert data["scenes"][0]["light"] is None
