@@ -13,6 +13,7 @@ from jaxtyping import Bool, UInt8
 
 from extrags.errors import ConfigError
 from extrags.metrics.registry import Metric
+from extrags.observed_surface import never_observed
 from extrags.report.downloads import file_name
 from extrags.report.encode import UNSEEN_RGB, as_uint8
 from extrags.report.image_table import ImageCell, Judged, image_cell, judged_table
@@ -120,7 +121,7 @@ def _strip(run: GalleryRun, folder: Path, largest_bytes: int, number_of_run: int
     said = {LABELS[kind]: _figures(run.results[kind]["per_view"][place], metrics) for kind in kinds}
     cells = [truth, *renders]
     if sequence.observed is not None:
-        unseen = ~sequence.observed[frame] & sequence.mask[frame]
+        unseen = never_observed(sequence, frame)
         share = 100 * float(unseen.sum() / max(1, sequence.mask[frame].sum()))
         alt = f"Frame {sequence.frame_name(frame)}, never observed: {share:.0f} %"
         seen = _tinted(sequence.rgb[frame], unseen)

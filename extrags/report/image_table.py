@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Int, UInt8
 
+from extrags.observed_surface import never_observed
 from extrags.report.encode import (
     OUTSIDE_RGB,
     UNSEEN_RGB,
@@ -114,10 +115,7 @@ def judged_table(
         largest_bytes: bound per image.
     """
     truth, masks = sequence.rgb[frames], sequence.mask[frames]
-    unseen = np.zeros_like(masks)
-    if sequence.observed is not None:
-        # The array says nothing about frames that are not held out.
-        unseen = ~sequence.observed[frames] & masks & np.isin(frames, sequence.test)[:, None, None]
+    unseen = never_observed(sequence, frames)
     errors = [np.abs(item.images.astype(np.float64) - truth).mean(-1) / 255 for item in judged]
     high = scale_end([error[masks] for error in errors])
     rows = []
