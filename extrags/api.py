@@ -12,17 +12,21 @@ from extrags.config import (
     PROFILES,
     AssessConfig,
     CoarseConfig,
+    ContinuationConfig,
     DepthConfig,
     EnhanceConfig,
     EvaluateConfig,
     ExploreConfig,
     FinetuneConfig,
     FreespaceConfig,
+    ImportedConfig,
     IngestConfig,
+    JudgeConfig,
     PipelineConfig,
     PosesConfig,
     ReportConfig,
     SurfaceConfig,
+    UcNerfConfig,
     profile_config,
 )
 from extrags.depth.estimate import DepthEstimate, estimate_depth, with_estimated_depth
@@ -37,7 +41,7 @@ from extrags.metrics.image import means_in_regions
 from extrags.metrics.protocol import EvaluationResult, RenderedViews
 from extrags.metrics.registry import Metric, register_metric
 from extrags.pipeline import STAGES
-from extrags.poses import estimate_poses, with_estimated_poses
+from extrags.poses import PoseEstimate, estimate_poses, with_estimated_poses
 from extrags.pseudo_views import PseudoViews
 from extrags.raster import Rendering, rasterize
 from extrags.restoration.backends import register_backend
@@ -54,6 +58,7 @@ __all__ = [
     "AssessConfig",
     "Cameras",
     "CoarseConfig",
+    "ContinuationConfig",
     "DepthConfig",
     "DepthEstimate",
     "EndoscopicSequence",
@@ -66,11 +71,14 @@ __all__ = [
     "FreeSpace",
     "FreespaceConfig",
     "Gaussians",
+    "ImportedConfig",
     "IngestConfig",
+    "JudgeConfig",
     "Mesh",
     "Metric",
     "NearFieldLight",
     "PipelineConfig",
+    "PoseEstimate",
     "PosesConfig",
     "PseudoViews",
     "RenderedViews",
@@ -82,6 +90,7 @@ __all__ = [
     "Split",
     "SurfaceConfig",
     "TrainingResult",
+    "UcNerfConfig",
     "assess",
     "carve",
     "estimate_depth",

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -53,6 +54,16 @@ def test_every_name_is_there_and_documented(name: str) -> None:
     assert value is getattr(api, name)
     if callable(value):
         assert inspect.getdoc(value), f"{name} has no docstring"
+
+
+def test_the_page_on_python_tells_every_name_with_the_first_sentence_of_its_docstring() -> None:
+    page = (Path(__file__).parents[1] / "docs" / "python.md").read_text(encoding="utf-8")
+    rows = dict(re.findall(r"^\| `(\w+)` \| (.+) \|$", page, flags=re.MULTILINE))
+    assert sorted(rows) == sorted(api.__all__)
+    for name, said in rows.items():
+        value = getattr(api, name)
+        if callable(value):
+            assert said == (inspect.getdoc(value) or "").split("\n\n")[0].replace("\n", " "), name
 
 
 def test_the_front_door_opens_late_and_wrong_names_are_refused() -> None:
