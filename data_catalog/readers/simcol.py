@@ -46,7 +46,9 @@ _MIRROR = np.diag([1.0, -1.0, 1.0])
 
 
 def _recognises(folder: Path) -> bool:
-    return any(folder.glob("SavedPosition*.txt")) and any(folder.glob("FrameBuffer_*.png"))
+    # Without its poses as well: depth would otherwise be taken for more frames.
+    others = any(folder.glob("SavedPosition*.txt")) or any(folder.glob("Depth_*.png"))
+    return others and any(folder.glob("FrameBuffer_*.png"))
 
 
 def _files(folder: Path) -> list[Path]:
@@ -165,7 +167,12 @@ def read_poses(folder: Path) -> Float[np.ndarray, "f 4 4"]:
 def _pose_file(folder: Path, start: str) -> Path:
     found = sorted(folder.glob(f"{start}*.txt"))
     if not found:
-        raise SourceNotFoundError("no such file", file=folder / f"{start}_*.txt")
+        raise SourceNotFoundError(
+            "no such file, though there are frames of SimCol3D (FrameBuffer_NNNN.png); expected the poses of "
+            "all. To have them estimated, give FrameBuffer_NNNN.png alone a folder of their own",
+            file=folder / f"{start}_*.txt",
+            field="world_from_camera",
+        )
     return found[0]
 
 

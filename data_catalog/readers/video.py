@@ -28,13 +28,13 @@ from data_catalog.folder_reader import FolderReader
 from data_catalog.footage import VIDEO_SUFFIXES, FootageFrame, TimeSpan, files_of_kind
 from data_catalog.images import image_entries
 from data_catalog.posed_frames import SourceFrames
+from data_catalog.readers.beside_frames import listed_files, tell_what_is_not_read
 from data_catalog.readers.footage_frames import footage_frames, footage_outline
 from data_catalog.readers.frames_folder import (
     FEWEST_FRAMES,
     INTRINSICS_FILE,
     MASK_FILE,
     is_mask,
-    listed_files,
     places_with_frames,
 )
 from extrags.config import IngestConfig
@@ -184,7 +184,7 @@ def only_file(place: Path, suffixes: tuple[str, ...]) -> Path | None:
 
 
 def tell_about_stills(place: Path, file: Path) -> None:
-    """Warn of the few pictures that lie beside a footage and are not read.
+    """Warn of the few pictures, and of poses, depth and masks, that lie beside a footage and are not read.
 
     Args:
         place: the folder that was given, or the footage itself, beside which nothing is looked for.
@@ -195,6 +195,7 @@ def tell_about_stills(place: Path, file: Path) -> None:
     """
     if place == file:
         return
+    tell_what_is_not_read(place)
     for folder, stills in places_with_frames(place).items():
         if len(stills) >= FEWEST_FRAMES:
             raise SourceError(

@@ -65,11 +65,15 @@ class TestIntrinsics:
         (tmp_path / "intrinsics.json").write_text(json.dumps({"field_of_view_deg": 80}))
         sequence = read(file)
         assert sequence.intrinsics == "given"
-        with pytest.raises(ConfigError, match="states its intrinsics itself"):
-            read(file, IngestConfig(calibration=str(calibration_file(tmp_path))))
+        assert sequence.K[0, 0, 0] == pytest.approx(160 / np.tan(np.radians(40)))
 
-    def test_a_calibration_file_takes_the_place_of_the_guess(self, tmp_path, caplog) -> None:
+    @pytest.mark.parametrize("stated", [None, {"field_of_view_deg": 80}, {"fx": 90, "k1": -0.3}])
+    def test_a_calibration_file_takes_the_place_of_the_guess_and_of_what_is_stated(
+        self, tmp_path, caplog, stated
+    ) -> None:
         file = write_video(tmp_path / "a.avi", moving_scene(12, *SIZE, speed=6))
+        if stated is not None:
+            (tmp_path / "intrinsics.json").write_text(json.dumps(stated))
         with caplog.at_level("WARNING"):
             sequence = read(file, IngestConfig(calibration=str(calibration_file(tmp_path))))
         assert sequence.intrinsics == "given"
