@@ -30,7 +30,14 @@ from data_catalog.content import content_mask, looked_at
 from data_catalog.folder_reader import FolderReader
 from data_catalog.footage import DICOM_SUFFIXES, VIDEO_SUFFIXES, files_of_kind
 from data_catalog.guessed_intrinsics import ASSUMED_FIELD_OF_VIEW_DEG, intrinsics_of_field_of_view
-from data_catalog.images import check_links, image_entries, image_size, read_colour, spread
+from data_catalog.images import (
+    check_links,
+    image_entries,
+    image_size,
+    order_for_fingerprint,
+    read_colour,
+    spread,
+)
 from data_catalog.interlacing import is_combed, is_interlaced
 from data_catalog.lens_entries import check_pinhole
 from data_catalog.posed_frames import PosedFrame, SourceFrames
@@ -246,6 +253,7 @@ READER = FolderReader(
     files=_files,
     frames=_frames,
     conventions="no poses and no depth; the poses stage finds them, in an arbitrary unit",
+    chosen=lambda folder: order_for_fingerprint(file.name for file in _images(folder)),
 )
 
 

@@ -31,7 +31,15 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from data_catalog.folder_reader import FolderReader
-from data_catalog.images import COLOUR_SUFFIXES, image_size, natural_key, read_depth, save_images
+from data_catalog.images import (
+    COLOUR_SUFFIXES,
+    file_key,
+    image_size,
+    natural_key,
+    order_for_fingerprint,
+    read_depth,
+    save_images,
+)
 from data_catalog.inside import inside
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from data_catalog.readers.frame_list import listed_split, load_frame_list, matrix_of, present_frames
@@ -98,6 +106,10 @@ def _files(folder: Path) -> list[Path]:
     return sorted(file for file in found if file.is_file())
 
 
+def _chosen(folder: Path) -> dict[str, Any]:
+    return order_for_fingerprint(entry["file_path"] for entry in _load(folder / TRANSFORMS_FILE)["frames"])
+
+
 def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     file = folder / TRANSFORMS_FILE
     content = _load(file)
@@ -112,7 +124,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
         content, known=_KEYS, known_of_frames=_KEYS, frame_name="file_path", file=file, others=_OTHER_KEYS
     )
     scale = _MM_PER_UNIT[unit]
-    listed = sorted(content["frames"], key=lambda entry: natural_key(entry["file_path"]))
+    listed = sorted(content["frames"], key=lambda entry: file_key(entry["file_path"]))
     files = {}
     for entry in listed:
         name = entry["file_path"]
@@ -165,6 +177,7 @@ READER = FolderReader(
     frames=_frames,
     conventions="OpenGL camera axes (y up, z backward, turned on reading), camera to world; "
     "depth in thousandths of the pose unit unless it says otherwise",
+    chosen=_chosen,
 )
 
 

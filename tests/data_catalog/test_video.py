@@ -429,6 +429,13 @@ class TestShots:
 
 
 class TestRefused:
+    @pytest.mark.parametrize("config", [IngestConfig(), IngestConfig(end_s=0.01)])
+    def test_a_single_frame_does_not_stand_still(self, tmp_path, config) -> None:
+        count = 1 if config.end_s is None else 12
+        file = write_video(tmp_path / "one.avi", moving_scene(count, *SIZE, speed=3))
+        with pytest.raises(SourceError, match=r"one\.avi, field frames: one frame alone, in the file or in"):
+            read(file, config)
+
     def test_a_scope_that_stands_still(self, tmp_path) -> None:
         file = write_video(tmp_path / "still.avi", np.repeat(moving_scene(1, *SIZE), 12, axis=0))
         with pytest.raises(SourceError, match=r"still\.avi, field motion: the picture moves by 0\.0%"):
