@@ -10,10 +10,18 @@ import logging
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 from extrags.errors import SourceError
 
-__all__ = ["check_one_format", "frames_among", "listed_files", "tell_about_pictures", "tell_what_is_not_read"]
+__all__ = [
+    "check_one_format",
+    "frames_among",
+    "listed_files",
+    "tell_about_folders",
+    "tell_about_pictures",
+    "tell_what_is_not_read",
+]
 
 logger = logging.getLogger(__name__)
 
@@ -141,6 +149,20 @@ def tell_what_is_not_read(folder: Path) -> None:
             f"{folder}: read without poses and depth; not read are {', '.join(found[:_NAMED_FILES])}{more}. "
             f"To have poses and depth read, give {_READ_WITH_POSES}{_of_sinus_set(names)}"
         )
+
+
+def tell_about_folders(folder: Path, field: Literal["depth", "mask"], instead: str) -> None:
+    """Warn of folders that are called like those of depth or masks, of a source of which none is read.
+
+    Args:
+        folder: of the source.
+        field: what they hold.
+        instead: what would be read, as the end of a sentence.
+    """
+    known = _DEPTH_FOLDERS if field == "depth" else _MASK_FOLDERS
+    for place in sorted(folder.iterdir()):
+        if place.name.lower() in known and place.is_dir():
+            _tell(f"{place} is not read; {instead}")
 
 
 def _tells_poses(place: Path) -> bool:

@@ -36,6 +36,7 @@ from data_catalog.folder_reader import FolderReader
 from data_catalog.images import COLOUR_SUFFIXES, file_key, natural_key, order_for_fingerprint, save_images
 from data_catalog.inside import inside
 from data_catalog.posed_frames import PosedFrame, SourceFrames
+from data_catalog.readers.beside_frames import tell_about_folders
 from data_catalog.readers.colmap_files import (
     ColmapImage,
     ColmapModel,
@@ -198,7 +199,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     splits = _splits(folder, listed)
     images = [image for image in listed if image.name in present and (not splits or image.name in splits)]
     used = [located[image.name] for image in images]
-    _tell_about_unmasked(folder, used)
+    _tell_what_is_lacking(folder, used)
     folders = [str(Path(item.name).parent) for item in used]
     recordings = sorted(set(folders), key=natural_key)
     frames = [
@@ -428,8 +429,10 @@ def _tell_about_unposed(root: Path, posed: set[str]) -> None:
         )
 
 
-def _tell_about_unmasked(folder: Path, frames: list[_ImageFiles]) -> None:
+def _tell_what_is_lacking(folder: Path, frames: list[_ImageFiles]) -> None:
     if (folder / "masks").is_dir():
         warn_of_unmasked(folder / "masks", {item.name: item.mask for item in frames})
-    elif (folder / "mask").is_dir():
-        logger.warning("%s is not read; masks are looked for in masks/", folder / "mask")
+    else:
+        tell_about_folders(folder, "mask", "masks are looked for in masks/")
+    if all(item.depth is None for item in frames):
+        tell_about_folders(folder, "depth", "depth is looked for in stereo/depth_maps/")

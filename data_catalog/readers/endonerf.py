@@ -77,10 +77,12 @@ def _part(folder: Path, names: tuple[str, ...]) -> list[Path]:
 
 
 def _not_read(folder: Path) -> list[str]:
-    """Folders of masks or depth in which there are files, and none of them an image, as sentences."""
+    """Folders of masks or depth that are not read, or hold files of which none is an image, as sentences."""
     said = []
     for field, names in (("masks", _MASK_FOLDERS), ("depth", _DEPTH_FOLDERS)):
-        place = next((folder / name for name in names if (folder / name).is_dir()), None)
+        there = [folder / name for name in names if (folder / name).is_dir()]
+        said += [f"{other.name}/ is not read, only {there[0].name}/" for other in there[1:]]
+        place = next(iter(there), None)
         if place is None or colour_files(place):
             continue
         others = sorted(file.name for file in place.iterdir() if file.is_file() and file.name[0] != ".")

@@ -55,6 +55,7 @@ from data_catalog.images import (
 from data_catalog.inside import inside
 from data_catalog.lens_entries import check_pinhole
 from data_catalog.posed_frames import PosedFrame, SourceFrames
+from data_catalog.readers.beside_frames import tell_about_folders
 from data_catalog.readers.frame_list import FilesBeside, load_frame_list, matrix_of, warn_of_unmasked
 from data_catalog.readers.unknown_keys import warn_of_unknown_keys
 from extrags.config import IngestConfig
@@ -211,6 +212,7 @@ def _stems(inner: Path) -> list[Path]:
 
 def _depth_files(folder: Path, names: list[str]) -> list[Path | None]:
     if not (folder / "depth").is_dir():
+        tell_about_folders(folder, "depth", "depth is looked for in depth/")
         return [None] * len(names)
     found = _beside(folder, "depth", names, DEPTH_SUFFIXES)
     for name, file in zip(names, found, strict=True):
@@ -234,8 +236,7 @@ def _depth_files(folder: Path, names: list[str]) -> list[Path | None]:
 
 def _mask_files(folder: Path, names: list[str]) -> list[Path | None]:
     if not (folder / "mask").is_dir():
-        if (folder / "masks").is_dir():
-            logger.warning("%s is not read; masks are looked for in mask/", folder / "masks")
+        tell_about_folders(folder, "mask", "masks are looked for in mask/")
         return [None] * len(names)
     found = _beside(folder, "mask", names, COLOUR_SUFFIXES)
     warn_of_unmasked(folder / "mask", dict(zip(names, found, strict=True)))

@@ -142,11 +142,22 @@ def read_poses(folder: Path) -> Float[np.ndarray, "f 4 4"]:
     """`world_from_camera` in OpenCV axes and mm, one for each line of the pose files.
 
     Raises:
-        PoseError: the two files differ in length, or a line is no pose.
+        PoseError: the two files differ in length or belong to different sequences, there are several of a
+            kind, or a line is no pose.
         SourceNotFoundError: a pose file is missing.
     """
     position_file = _pose_file(folder, "SavedPosition")
     rotation_file = _pose_file(folder, "SavedRotationQuaternion")
+    of_positions, of_rotations = (
+        file.stem.removeprefix(start)
+        for file, start in ((position_file, "SavedPosition"), (rotation_file, "SavedRotationQuaternion"))
+    )
+    if of_positions != of_rotations:
+        raise PoseError(
+            f"the rotations beside it are {rotation_file.name}, by its name of another sequence",
+            file=position_file,
+            field="world_from_camera",
+        )
     positions = _numbers(position_file, 3)
     quaternions = _numbers(rotation_file, 4)
     if len(positions) != len(quaternions):
@@ -171,6 +182,12 @@ def _pose_file(folder: Path, start: str) -> Path:
             "no such file, though there are frames of SimCol3D (FrameBuffer_NNNN.png); expected the poses of "
             "all. To have them estimated, give FrameBuffer_NNNN.png alone a folder of their own",
             file=folder / f"{start}_*.txt",
+            field="world_from_camera",
+        )
+    if len(found) > 1:
+        raise PoseError(
+            f"beside {found[0].name}, and nothing tells which of them belongs to these frames; expected one",
+            file=found[1],
             field="world_from_camera",
         )
     return found[0]

@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import json
 import logging
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -34,6 +35,7 @@ from data_catalog.folder_reader import FolderReader
 from data_catalog.images import (
     COLOUR_SUFFIXES,
     file_key,
+    image_entries,
     image_size,
     natural_key,
     order_for_fingerprint,
@@ -42,6 +44,7 @@ from data_catalog.images import (
 )
 from data_catalog.inside import inside
 from data_catalog.posed_frames import PosedFrame, SourceFrames
+from data_catalog.readers.beside_frames import frames_among, listed_files, tell_about_folders
 from data_catalog.readers.frame_list import listed_split, load_frame_list, matrix_of, present_frames
 from data_catalog.readers.unknown_keys import warn_of_unknown_keys
 from extrags.array_files import load_ply_vertices
@@ -129,6 +132,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     for entry in listed:
         name = entry["file_path"]
         files[name] = _with_suffix(inside(folder, name, file=file, frame=name, field="file_path"))
+    _check_apart(files, "file_path", "the image is listed twice, as {}", file)
     present = present_frames(files, config.max_absent_share, listing=file)
     splits = _splits(content, file)
     used = present & splits.keys() if splits else present
@@ -150,6 +154,13 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
                 split=splits.get(frame),
             )
         )
+    depths = {frame.name: frame.depth_file for frame in frames if frame.depth_file is not None}
+    _check_apart(depths, "depth_file_path", "the depth of {} as well; expected one file for each frame", file)
+    if not depths:
+        tell_about_folders(folder, "depth", "no frame names a file in it (depth_file_path)")
+    if not any(frame.mask_file for frame in frames):
+        tell_about_folders(folder, "mask", "no frame names a file in it (mask_path)")
+    _tell_about_unlisted(file, frames, files.values())
     points, points_rgb = _points(folder, content, file)
 
     def depth_of(depth_file: Path, frame: str | int) -> Float[np.ndarray, "h w"]:
@@ -245,6 +256,35 @@ def _with_suffix(file: Path) -> Path:
         return file
     candidates = (file.with_name(file.name + suffix) for suffix in COLOUR_SUFFIXES)
     return next((candidate for candidate in candidates if candidate.is_file()), file)
+
+
+def _check_apart(files: Mapping[str, Path], field: str, problem: str, file: Path) -> None:
+    """Refuse a file that two frames name, by whatever path.
+
+    Raises:
+        SourceError: names the second frame.
+    """
+    owner: dict[Path, str] = {}
+    for frame, place in files.items():
+        first = owner.setdefault(place, frame)
+        if first != frame:
+            raise SourceError(problem.format(first), file=file, frame=frame, field=field)
+
+
+def _tell_about_unlisted(file: Path, frames: list[PosedFrame], listed: Collection[Path]) -> None:
+    """Warn of images beside those of the frames that the file does not list."""
+    known = {*listed, *(place for frame in frames for place in (frame.mask_file, frame.depth_file) if place)}
+    places = sorted({frame.file.parent for frame in frames})
+    beside = [image for place in places for image in frames_among(image_entries(place))[0]]
+    unlisted = [image for image in beside if image not in known]
+    if unlisted:
+        logger.warning(
+            "%s: %d of %d images beside those of its frames are not listed, and left out: %s",
+            file,
+            len(unlisted),
+            len(beside),
+            listed_files(unlisted),
+        )
 
 
 def _beside(folder: Path, entry: dict[str, Any], key: str, frame: str) -> Path | None:

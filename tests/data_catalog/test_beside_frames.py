@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +13,10 @@ from data_catalog.catalog import read, resolve
 from data_catalog.findings import Finding
 from data_catalog.inspection import inspect
 from data_catalog.readers.beside_frames import frames_among
-from extrags.errors import SourceError, SourceNotFoundError
+from data_catalog.readers.transforms_json import write_transforms
+from extrags.errors import PoseError, SourceError, SourceNotFoundError
 from tests.data_catalog.footage_fixture import write_video
+from tests.data_catalog.layouts import write_endonerf
 from tests.data_catalog.test_content import moving_scene
 from tests.data_catalog.test_which_frames import write_frames
 
@@ -153,6 +156,23 @@ class TestPosesAndDepth:
         with pytest.raises(SourceNotFoundError, match=rf"{absent}_\*\.txt.*expected the poses of all"):
             read(tmp_path)
 
+    @pytest.mark.parametrize(
+        ("names", "problem"),
+        [
+            (["SavedPosition_S1", "SavedPosition_S2", "SavedRotationQuaternion_S1"], "nothing tells which"),
+            (["SavedPosition_S1", "SavedRotationQuaternion_S2"], "by its name of another sequence"),
+        ],
+    )
+    def test_simcol3d_with_poses_of_another_sequence_is_refused(self, tmp_path, names, problem) -> None:
+        """The first in alphabetical order were taken."""
+        for number, image in enumerate(moving_scene(3, 48, 48)):
+            Image.fromarray(image).save(tmp_path / f"FrameBuffer_{number:04d}.png")
+        for name in names:
+            count = 3 if "Position" in name else 4
+            (tmp_path / f"{name}.txt").write_text((" ".join(["1"] * count) + "\n") * 3)
+        with pytest.raises(PoseError, match=problem):
+            read(tmp_path)
+
     def test_beside_a_video_as_well(self, tmp_path, caplog) -> None:
         write_video(tmp_path / "exam.avi", moving_scene(30, 64, 48, speed=2))
         (tmp_path / "poses.csv").write_text("1")
@@ -161,3 +181,51 @@ class TestPosesAndDepth:
         caplog.clear()
         read(tmp_path / "exam.avi")
         assert "poses.csv" not in caplog.text
+
+
+class TestOtherLayouts:
+    """Depth and masks that a layout does not look for were dropped without a word."""
+
+    @pytest.mark.parametrize(
+        ("name", "instead"),
+        [("depths", "depth is looked for in depth/"), ("masks", "masks are looked for in")],
+    )
+    def test_poses_json(self, posed_folder, name, instead) -> None:
+        (posed_folder / "depth").rename(posed_folder / name)
+        (finding,) = not_read(posed_folder)
+        assert f"{name} is not read; {instead}" in finding.sentence
+
+    def test_transforms_json(self, clip, tmp_path, caplog) -> None:
+        write_transforms(clip, tmp_path)
+        assert not_read(tmp_path) == []
+        assert "are not listed" not in caplog.text
+        (tmp_path / "masks").mkdir()
+        content = json.loads((tmp_path / "transforms.json").read_text())
+        for entry in content["frames"]:
+            entry.pop("depth_file_path")
+        left_out = content["frames"].pop()["file_path"]
+        content["test_filenames"], content["train_filenames"] = [], []
+        (tmp_path / "transforms.json").write_text(json.dumps(content))
+        found = [finding.sentence.partition("is not read; ")[2] for finding in not_read(tmp_path)]
+        assert found == [f"no frame names a file in it ({key})" for key in ("depth_file_path", "mask_path")]
+        told = f"1 of {len(clip)} images beside those of its frames are not listed, and left out: "
+        assert told + Path(left_out).name in caplog.text
+
+    @pytest.mark.parametrize(
+        ("key", "problem"),
+        [("file_path", "the image is listed twice, as"), ("depth_file_path", "the depth of .* as well")],
+    )
+    def test_one_file_of_two_frames_in_transforms_json(self, clip, tmp_path, key, problem) -> None:
+        write_transforms(clip, tmp_path)
+        content = json.loads((tmp_path / "transforms.json").read_text())
+        content["frames"][3][key] = "./" + content["frames"][2][key]
+        content["test_filenames"], content["train_filenames"] = [], []
+        (tmp_path / "transforms.json").write_text(json.dumps(content))
+        with pytest.raises(SourceError, match=f"field {key}: {problem}"):
+            read(tmp_path)
+
+    def test_endonerf(self, clip, tmp_path, caplog) -> None:
+        write_endonerf(clip, tmp_path, clip.mask)
+        (tmp_path / "gt_masks").mkdir()
+        read(tmp_path)
+        assert "gt_masks/ is not read, only masks/" in caplog.text

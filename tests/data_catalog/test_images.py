@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from data_catalog.image_pages import pages_in
 from data_catalog.images import (
     UPRIGHT,
     colour_files,
@@ -120,6 +121,17 @@ def test_webp_is_read(tmp_path: Path) -> None:
     assert [file.name for file in colour_files(tmp_path)] == ["a.webp"]
     Image.fromarray(np.full((20, 30, 3), 90, np.uint8)).save(tmp_path / "b.webp", quality=80)
     assert np.abs(read_colour(tmp_path / "b.webp").astype(int) - 90).max() < 4
+
+
+@pytest.mark.parametrize("name", ["a.tif", "a.webp", "a.png"])
+def test_several_pictures_in_a_file_are_counted(tmp_path: Path, name: str) -> None:
+    first, second = (Image.new("RGB", (20, 30), (value, 0, 0)) for value in (10, 200))
+    first.save(tmp_path / name, save_all=True, append_images=[second])
+    assert pages_in(tmp_path / name) == 2
+    first.save(tmp_path / name)
+    assert pages_in(tmp_path / name) == 1
+    (tmp_path / name).write_bytes(b"damaged")
+    assert pages_in(tmp_path / name) == 1
 
 
 class TestDepthOfAPalette:

@@ -28,6 +28,7 @@ from tests.data_catalog.footage_fixture import (
     write_cut_out,
     write_flagged,
     write_late,
+    write_streams,
     write_ten_bit,
     write_video,
 )
@@ -426,6 +427,21 @@ class TestShots:
         for frame in source.frames:
             source.read_colour(frame)
         assert most <= 3
+
+
+class TestStreams:
+    def test_a_cover_is_no_video(self, tmp_path, caplog) -> None:
+        """Nor is it a second camera."""
+        scene = moving_scene(12, *SIZE, speed=6)
+        file = write_streams(tmp_path / "a.mp4", [scene[:1] // 2, scene], cover_first=True)
+        assert len(read(file)) > 6
+        assert "streams of pictures" not in caplog.text
+
+    def test_a_second_camera_is_told_of(self, tmp_path, caplog) -> None:
+        scene = moving_scene(12, *SIZE, speed=6)
+        file = write_streams(tmp_path / "a.mkv", [scene, scene[::-1]])
+        assert len(read(file)) > 6
+        assert "a.mkv: 2 streams of pictures, as of two cameras; the first is read" in caplog.text
 
 
 class TestRefused:

@@ -206,3 +206,11 @@ def test_copies_that_windows_numbers_are_read_in_order(tmp_path) -> None:
     assert read(tmp_path).frame_names == ("frame", *(f"frame ({k})" for k in range(2, 10)))
     assert not [finding for finding in inspect(tmp_path).findings if finding.topic == "order of frames"]
     assert source_fingerprint(tmp_path)["order"] == "without suffixes"
+
+
+def test_pages_that_are_not_read_are_told(tmp_path, caplog) -> None:
+    scene = [Image.fromarray(image) for image in moving_scene(6, 48, 42)]
+    for number, image in enumerate(scene):
+        image.save(tmp_path / f"{number}.tif", save_all=True, append_images=scene[:2])
+    assert len(read(tmp_path)) == 6
+    assert caplog.text.count("0.tif: 3 pictures in the file, as pages or an animation") == 1
