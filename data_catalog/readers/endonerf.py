@@ -99,8 +99,11 @@ def _recognises(folder: Path) -> bool:
 
 
 def _files(folder: Path) -> list[Path]:
-    parts = (_part(folder, names) for names in (_IMAGE_FOLDERS, _MASK_FOLDERS, _DEPTH_FOLDERS))
-    return sorted([folder / POSES_FILE, *(file for part in parts for file in part)])
+    images = _part(folder, _IMAGE_FOLDERS)
+    # Here as well: what an earlier version paired wrongly must not be found in a store.
+    masks = _matching(_part(folder, _MASK_FOLDERS), images, "mask")
+    depths = _matching(_part(folder, _DEPTH_FOLDERS), images, "depth")
+    return sorted([folder / POSES_FILE, *images, *masks, *depths])
 
 
 def _chosen(folder: Path) -> dict[str, Any]:

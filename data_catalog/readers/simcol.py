@@ -52,8 +52,8 @@ def _recognises(folder: Path) -> bool:
 
 
 def _files(folder: Path) -> list[Path]:
-    patterns = ("FrameBuffer_*.png", "Depth_*.png", "SavedPosition*.txt", "SavedRotationQuaternion*.txt")
-    return sorted(file for pattern in patterns for file in folder.glob(pattern))
+    frames = [file for pattern in ("FrameBuffer_*.png", "Depth_*.png") for file in folder.glob(pattern)]
+    return sorted([*frames, *_pose_files(folder)])
 
 
 def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
@@ -146,18 +146,7 @@ def read_poses(folder: Path) -> Float[np.ndarray, "f 4 4"]:
             kind, or a line is no pose.
         SourceNotFoundError: a pose file is missing.
     """
-    position_file = _pose_file(folder, "SavedPosition")
-    rotation_file = _pose_file(folder, "SavedRotationQuaternion")
-    of_positions, of_rotations = (
-        file.stem.removeprefix(start)
-        for file, start in ((position_file, "SavedPosition"), (rotation_file, "SavedRotationQuaternion"))
-    )
-    if of_positions != of_rotations:
-        raise PoseError(
-            f"the rotations beside it are {rotation_file.name}, by its name of another sequence",
-            file=position_file,
-            field="world_from_camera",
-        )
+    position_file, rotation_file = _pose_files(folder)
     positions = _numbers(position_file, 3)
     quaternions = _numbers(rotation_file, 4)
     if len(positions) != len(quaternions):
@@ -173,6 +162,23 @@ def read_poses(folder: Path) -> Float[np.ndarray, "f 4 4"]:
         rotation = _MIRROR @ unity @ _MIRROR
         poses.append(compose(rotation, _MIRROR @ np.asarray(position) * _MM_PER_CM))
     return np.stack(poses)
+
+
+def _pose_files(folder: Path) -> tuple[Path, Path]:
+    """The positions and the rotations of one sequence."""
+    position_file = _pose_file(folder, "SavedPosition")
+    rotation_file = _pose_file(folder, "SavedRotationQuaternion")
+    of_positions, of_rotations = (
+        file.stem.removeprefix(start)
+        for file, start in ((position_file, "SavedPosition"), (rotation_file, "SavedRotationQuaternion"))
+    )
+    if of_positions != of_rotations:
+        raise PoseError(
+            f"the rotations beside it are {rotation_file.name}, by its name of another sequence",
+            file=position_file,
+            field="world_from_camera",
+        )
+    return position_file, rotation_file
 
 
 def _pose_file(folder: Path, start: str) -> Path:

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from data_catalog.catalog import read, resolve
+from data_catalog.catalog import read, resolve, source_fingerprint
 from data_catalog.inspection import inspect
 from data_catalog.readers.endonerf import mask_polarity, polarity_of_images
 from extrags.errors import SourceError
@@ -70,6 +70,9 @@ class TestNumbersOfNames:
             r"images/frame-000004\.png, and the one before it, frame-000002\.png, to",
         ):
             read(tmp_path)
+        # Nor is what was made of it before.
+        with pytest.raises(SourceError, match="their numbers go apart"):
+            source_fingerprint(tmp_path)
 
     def test_a_file_too_many_and_one_missing_are_refused(self, clip, tmp_path) -> None:
         self.written(clip, tmp_path, "depth")
