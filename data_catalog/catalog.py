@@ -207,10 +207,15 @@ def _settings(config: IngestConfig | None, function: str) -> IngestConfig:
     """What a function was given, or the defaults.
 
     Raises:
-        ConfigError: other settings, such as those of all stages.
+        ConfigError: other settings, such as those of all stages, or a size that is given twice.
     """
     config = IngestConfig() if config is None else config
     check_settings_argument(config, IngestConfig, function, 'extrags.PROFILES["quick"].ingest')
+    if config.width is not None and config.downscale is not None:
+        raise ConfigError(
+            f"ingest.width = {config.width} and ingest.downscale = {config.downscale} both set the size of "
+            "frames; give one of the two (ingest.downscale none takes back one from a file of settings)"
+        )
     return config
 
 

@@ -6,6 +6,8 @@ another package is handed to `register_reader`.
 
 from __future__ import annotations
 
+import os
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,7 @@ from data_catalog.calibration_files import with_calibration_file
 from data_catalog.dataset import Descriptor, Source
 from data_catalog.folder_reader import FolderReader, Glance
 from data_catalog.footage import DICOM_SUFFIXES, VIDEO_SUFFIXES, files_of_kind
+from data_catalog.images import COLOUR_SUFFIXES, image_entries, natural_key
 from data_catalog.named_folders import find_folder, not_on_this_machine
 from data_catalog.posed_frames import SourceFrames
 from data_catalog.readers import (
@@ -49,6 +52,11 @@ READERS: tuple[FolderReader, ...] = (
 """The most specific first: a folder is read by the first that recognises it."""
 
 _registered: list[FolderReader] = []
+_OTHER_IMAGES = (
+    *(".gif", ".jp2", ".j2k", ".avif", ".heic", ".heif", ".exr", ".hdr", ".pgm", ".ppm", ".pnm", ".tga"),
+    *(".dng", ".npy", ".npz"),
+)
+"""Images that are not read as frames."""
 _NAMED_FILES = 5
 """So many of the files between which a user has to choose are named."""
 
@@ -168,12 +176,32 @@ def _recognised(path: Path) -> FolderReader:
         )
     # Those of the catalogue are described where the message says; others nowhere else.
     more = "".join(f", {reader.name} ({reader.summary})" for reader in _registered)
+    kinds = ", ".join(COLOUR_SUFFIXES)
     raise SourceNotFoundError(
-        "no sequence recognised in this folder; expected images, a video, a DICOM file, a COLMAP model, "
+        f"no sequence recognised in this folder{_what_is_there(path)}; expected images ({kinds}) in it, "
+        "in images/ or in rgb/, a video, a DICOM file, a COLMAP model, "
         f"transforms.json, poses.json, C3VD, SimCol3D, EndoNeRF or the sinus set{more} (the layout of each: "
         "docs/sources.md)",
         file=path,
     )
+
+
+def _what_is_there(path: Path) -> str:
+    """What a user may have meant in a folder that no reader recognises, as the rest of a clause."""
+    below = sorted((place for place in path.iterdir() if place.is_dir()), key=lambda at: natural_key(at.name))
+    # What may not be looked into holds nothing to name.
+    counted = [(len(image_entries(at)) if os.access(at, os.R_OK | os.X_OK) else 0, at.name) for at in below]
+    holding = [f"{name}/ ({count})" for count, name in counted if count]
+    if holding:
+        more = f" and {len(holding) - _NAMED_FILES} more" if len(holding) > _NAMED_FILES else ""
+        return (
+            f", but images in {', '.join(holding[:_NAMED_FILES])}{more}: give the path of the folder to read"
+        )
+    others = Counter(file.suffix.lower() for file in path.iterdir() if file.suffix.lower() in _OTHER_IMAGES)
+    if others:
+        told = " and ".join(f"{count} {suffix} files" for suffix, count in others.most_common())
+        return f": {told}, which are not read"
+    return ""
 
 
 def _listed(files: list[Path]) -> str:

@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -20,13 +21,17 @@ from extrags.sequence import EndoscopicSequence
 
 __all__ = [
     "COLOUR_SUFFIXES",
+    "DEPTH_SUFFIXES",
     "UPRIGHT",
     "bits_per_value",
     "check_links",
     "colour_files",
+    "depth_suffixes_in_words",
+    "file_key",
     "image_entries",
     "image_size",
     "natural_key",
+    "order_for_fingerprint",
     "orientation",
     "read_colour",
     "read_depth",
@@ -42,10 +47,12 @@ _ORIENTATION = 274
 UPRIGHT = 1
 """Orientation of images whose pixels lie as they are shown."""
 _TIFF_SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-COLOUR_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+COLOUR_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+DEPTH_SUFFIXES = (".npy", ".tiff", ".tif", ".png")
 _MASK_THRESHOLD = 127
 _LOSSY_SUFFIXES = (".jpg", ".jpeg")
-"""Their black is not all of one value: they hold no labels."""
+_LOSSLESS_WEBP = b"VP8L"
+"""Of the part that holds the pixels; of lossy ones it has a blank."""
 
 
 def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
@@ -58,6 +65,26 @@ def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
         for part, number in zip(parts, digits, strict=True)
         if part
     )
+
+
+def file_key(name: str) -> tuple[tuple[tuple[int, int, str], ...], str]:
+    """Sort key of an image's name or path: by `natural_key` without suffix, `a.png` before `a (2).png`."""
+    stem, _, suffix = name.rpartition(".")
+    return natural_key(stem if f".{suffix.lower()}" in COLOUR_SUFFIXES else name), name
+
+
+def order_for_fingerprint(names: Iterable[str]) -> dict[str, Any]:
+    """What a cache key must tell of the order of images, which is in none of their files.
+
+    Args:
+        names: of the images, or their paths.
+
+    Returns:
+        Nothing where suffixes make no difference to the order: earlier versions took them into account, and
+        their artefacts stay.
+    """
+    listed = sorted(sorted(names), key=natural_key)
+    return {} if listed == sorted(listed, key=file_key) else {"order": "without suffixes"}
 
 
 def colour_files(folder: Path) -> list[Path]:
@@ -83,7 +110,7 @@ def image_entries(folder: Path) -> list[Path]:
         and not file.name.startswith(".")
         and (file.is_file() or _leads_nowhere(file))
     ]
-    return sorted(named, key=lambda file: natural_key(file.name))
+    return sorted(named, key=lambda file: file_key(file.name))
 
 
 def check_links(files: Iterable[Path]) -> None:
@@ -207,7 +234,8 @@ def read_mask(file: Path, *, frame: object = None) -> Bool[np.ndarray, "h w"]:
             frame=frame,
             field="mask",
         )
-    if found[-1] > _MASK_THRESHOLD or file.suffix.lower() in _LOSSY_SUFFIXES:
+    # Of what is lossy, black is not all of one value: it holds no labels.
+    if found[-1] > _MASK_THRESHOLD or _is_lossy(file):
         return np.asarray(values > _MASK_THRESHOLD)
     if found[-1] > 1 and (len(found) > 2 or found[0] > 0):
         raise SourceError(
@@ -218,6 +246,11 @@ def read_mask(file: Path, *, frame: object = None) -> Bool[np.ndarray, "h w"]:
             field="mask",
         )
     return np.asarray(values > 0)
+
+
+def _is_lossy(file: Path) -> bool:
+    suffix = file.suffix.lower()
+    return suffix in _LOSSY_SUFFIXES or (suffix == ".webp" and _LOSSLESS_WEBP not in file.read_bytes())
 
 
 def read_depth(file: Path, *, frame: object = None) -> Float[np.ndarray, "h w"]:
@@ -311,6 +344,11 @@ def _stored_numbers(file: Path, frame: object) -> np.ndarray:
     return colours[..., 0]
 
 
+def depth_suffixes_in_words() -> str:
+    """The files that hold depth, for messages."""
+    return f"{', '.join(DEPTH_SUFFIXES[:-1])} or {DEPTH_SUFFIXES[-1]} with one number per pixel"
+
+
 @contextmanager
 def _image_errors(file: Path, frame: object, field: str) -> Iterator[None]:
     """What Pillow raises for a file, as the errors of a source."""
@@ -325,9 +363,13 @@ def _image_errors(file: Path, frame: object, field: str) -> Iterator[None]:
             is_tiff = stream.read(4) in _TIFF_SIGNATURES
         # Those of 64-bit numbers, which numpy's are unless somebody asks for others.
         kind = "a TIFF of a kind that is not read, expected are numbers of at most 32 bits"
+        if field == "depth" and file.suffix.lower() not in DEPTH_SUFFIXES:
+            problem = f"depth of this format is not read; expected {depth_suffixes_in_words()}"
+        else:
+            damage = f"or damaged from its first bytes ({file.stat().st_size} bytes)"
+            problem = f"{kind if is_tiff else 'not an image'}, {damage}"
         raise SourceError(
-            f"{kind if is_tiff else 'not an image'}, or damaged from its first bytes "
-            f"({file.stat().st_size} bytes)",
+            problem,
             file=file,
             frame=frame,
             field=field,

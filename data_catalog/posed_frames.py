@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float, UInt8
 from data_catalog.checks import check_depth, check_intrinsics, check_pose
 from data_catalog.depth_steps import DepthSteps
 from data_catalog.guessed_intrinsics import fitted_to_picture
+from data_catalog.image_pages import tell_about_pages
 from data_catalog.images import (
     COLOUR_SUFFIXES,
     UPRIGHT,
@@ -179,6 +180,7 @@ def assembled(source: SourceFrames, config: IngestConfig, name: str) -> Endoscop
         emit(Progress("ingest", index, source.looked_at + len(kept)))
     pixels.tell(kept)
     _tell_about_orientation(kept)
+    tell_about_pages(kept[0].file)
     K = np.stack([pixels.samplings[frame.lens].K for frame in kept])
     rgb, mask = pixels.colours.array, pixels.masks(kept)
     if source.intrinsics == "guessed":

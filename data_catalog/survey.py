@@ -203,8 +203,15 @@ def choose_frames(
         Indices of frames, ascending.
 
     Raises:
-        SourceError: the picture hardly moves.
+        SourceError: the picture hardly moves, or there is a single one.
     """
+    if len(path) == 1:
+        raise SourceError(
+            "one frame alone, in the file or in the part of it that is read (ingest.start_s, ingest.end_s, "
+            "cuts); a reconstruction needs the scope to move",
+            file=file,
+            field="frames",
+        )
     path = path - path[0]
     total = float(path[-1])
     if total < _MIN_MOTION:

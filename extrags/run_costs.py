@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import resources
 from statistics import median
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,8 +23,12 @@ from extrags.config import PipelineConfig
 from extrags.errors import ConfigError
 from extrags.frame_stacks import MAPPED_BYTES
 
+if TYPE_CHECKING:
+    from extrags.raster.bench import BenchSize
+
 __all__ = [
     "MEMORY_TERMS",
+    "RENDERING",
     "STAGE_TASKS",
     "TIME_TERMS",
     "CostModel",
@@ -34,6 +38,7 @@ __all__ = [
     "fitted",
     "packaged_model",
     "probe_seconds",
+    "probed_rasteriser",
     "stage_seconds",
     "stage_tasks",
 ]
@@ -107,6 +112,10 @@ HELD_PIXELS = MAPPED_BYTES / 3
 """Of all frames together, at most: the images of more are a mapped file, which the memory does not count."""
 RESTORING = frozenset({"enhance-train", "enhance", "finetune-judge", "evaluate-restore"})
 """Tasks that prepare the restorer of `enhance.backend`, or run it."""
+RENDERING = frozenset(
+    {"coarse", "assess", "surface", "freespace", "explore", "finetune-judge", "finetune", "evaluate-render"}
+)
+"""Tasks whose time is that of the rasteriser."""
 FITTED_BACKEND = "embedded"
 """The only one that there are records of."""
 OF_FINAL_SCENE = frozenset({"finetune", "evaluate-render", "evaluate-restore", "evaluate-views", "evaluate"})
@@ -430,18 +439,47 @@ def packaged_model() -> CostModel:
     return CostModel.from_json(json.loads(text))
 
 
+def probed_rasteriser() -> str:
+    """The rasteriser that `probe_seconds` runs: `native`, else what renders here in its place."""
+    # Here, because it loads torch and the kernels.
+    from extrags.raster import available_backends, native
+
+    return "native" if native.native_isa() is not None else available_backends()[0]
+
+
 def probe_seconds() -> float:
     """Processor time of rendering and differentiating a small scene once, in seconds.
 
-    The probe takes about one second. Compare with `CostModel.probe_s` to tell how fast this machine is.
+    The probe takes about one second, of the reference rasteriser two. Compare with `CostModel.probe_s` to
+    tell how fast this machine is.
     """
     # Here, because it loads torch and the kernels.
     from extrags.raster.bench import BenchSize, bench_raster
 
     size = BenchSize(160, 128, 10_000)
+    rasteriser = probed_rasteriser()
+    if rasteriser != "native":
+        return _seconds_of_peer(rasteriser, size)
     found = [
         bench_raster([size], peers=(), threads=(1,), rounds=PROBE_ROUNDS, with_error=False)
         for _ in range(PROBE_REPEATS)
     ]
     # The least: other work on the machine shares its caches, and only ever slows.
     return min(float(item["cases"][0]["cpu_ms"]["iteration"]) for item in found) / 1e3
+
+
+def _seconds_of_peer(rasteriser: str, size: BenchSize) -> float:
+    import torch
+
+    from extrags.raster.bench import bench_scene
+    from extrags.raster.peers import TimedPeer, use_threads
+
+    peer, threads = TimedPeer(rasteriser, bench_scene(size), training=False), torch.get_num_threads()
+    use_threads(rasteriser, 1)
+    try:
+        for _ in range(PROBE_ROUNDS):
+            if not peer.finished:
+                peer.iteration()
+    finally:
+        torch.set_num_threads(threads)
+    return float(peer.summary()["cpu_ms"]["iteration"]) / 1e3

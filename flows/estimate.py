@@ -13,7 +13,7 @@ from extrags.run_costs import Workload, packaged_model, stage_tasks
 from flows.workloads import task_repeats, usual_work
 from tasks.progress import StageProgress, duration_text
 
-__all__ = ["RunEstimate", "SequenceEstimate", "expected_seconds", "usual_pace"]
+__all__ = ["RunEstimate", "SequenceEstimate", "expected_seconds", "usual_pace", "without_kernels_in_words"]
 
 OTHER_SECONDS: dict[str, float] = {"depth": 30.0, "report": 4.0}
 """Of processor time: tasks whose cost no model knows, for a recording of the phantom. Depth grows with the
@@ -86,6 +86,16 @@ def expected_seconds(
 def usual_pace() -> float:
     """Elapsed seconds per second of processor time, of a run that has this machine to itself."""
     return 1 / (1 + USED_SHARE * (usable_cores() - 1))
+
+
+def without_kernels_in_words() -> str:
+    """What to add to an expected time where the compiled kernels, which the model rests on, are missing."""
+    # Here, because it loads torch.
+    from extrags.raster import available_backends
+
+    if available_backends()[0] != "reference":
+        return ""
+    return ", with the compiled kernels; these are missing here, and what renders takes many times as long"
 
 
 def _seconds_of_poses(work: Workload) -> float:

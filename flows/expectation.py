@@ -14,7 +14,7 @@ from extrags.pipeline import STAGES, StageName
 from extrags.run_costs import Workload
 from extrags.store import Store, digest_of
 from flows.cases import SequenceCase
-from flows.estimate import expected_seconds, usual_pace
+from flows.estimate import expected_seconds, usual_pace, without_kernels_in_words
 from flows.methods import METHODS
 from flows.outcome_records import OutcomeRecord, outcome_records, record_of, recorded_name
 from flows.workloads import known_work, work_before_reading
@@ -120,7 +120,7 @@ def expected_words(expected: Sequence[Expectation], at_once: int = 1, *, process
     }
     given = [f"{count} {reason}" for reason, count in reasons.items() if count]
     words += [", ".join(given)] if len(given) > 1 else [item.partition(" ")[2] for item in given]
-    return "; ".join(words)
+    return "; ".join(words) + (without_kernels_in_words() if known < len(expected) else "")
 
 
 def _is_finished(record: OutcomeRecord, config: PipelineConfig, until: StageName, keys: set[str]) -> bool:

@@ -12,7 +12,7 @@ from extrags.errors import ConfigError, DamagedArtefactError
 from extrags.memory_estimate import FrameSize, MemoryEstimate, estimate_memory, fitting_settings
 from extrags.pipeline import STAGES, StageName
 from flows.cached_stages import CachedStages
-from flows.estimate import expected_seconds
+from flows.estimate import expected_seconds, without_kernels_in_words
 from flows.runners import NotInStoreError
 from flows.workloads import frames_work
 from tasks.progress import duration_text, observed
@@ -64,7 +64,7 @@ def check_memory(
     expected = expected_seconds(config, frames_work(counts, config))
     ahead = set(STAGES[1 : STAGES.index(until) + 1]).difference(leave_out, made)
     seconds = sum(sum(expected[stage].values()) for stage in ahead)
-    log.info("%s, and about %s of processor time", what, duration_text(seconds))
+    log.info("%s, and about %s of processor time%s", what, duration_text(seconds), without_kernels_in_words())
     if limit_gb is None or found.peak_gb <= limit_gb:
         return found
     settings = fitting_settings(config, size, limit_gb, threads=threads, until=until, leave_out=leave_out)

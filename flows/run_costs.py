@@ -10,6 +10,7 @@ from extrags.config import PipelineConfig
 from extrags.errors import StoreError
 from extrags.pipeline import STAGES
 from extrags.run_costs import (
+    RENDERING,
     STAGE_TASKS,
     CostModel,
     TaskCost,
@@ -17,6 +18,7 @@ from extrags.run_costs import (
     beyond_the_fit,
     packaged_model,
     probe_seconds,
+    probed_rasteriser,
     stage_tasks,
 )
 from extrags.scene_plan import ScenePlan
@@ -65,7 +67,8 @@ class RunPrediction:
 
     Args:
         stages: those that run.
-        source: what tells how fast this machine is: `history` of the store, or a `probe`.
+        source: what tells how fast this machine is: `history` of the store, a `probe`, or `probe of
+            RASTERISER` where the compiled kernels are missing.
         records: so many records the history has.
         unknown: stages, and tasks of stages, that run and of whose cost nothing is known; not in any sum.
     """
@@ -109,7 +112,7 @@ class Pace:
     """How much longer tasks take here than on the reference machine, by task.
 
     Args:
-        source: `history` of a store, or a `probe`.
+        source: `history` of a store, a `probe`, or `probe of RASTERISER` without the compiled kernels.
         records: so many records the history has.
         processor: factors of processor time; tasks of which nothing is known are not among them.
         elapsed: factors of elapsed time; empty where nothing is known of it.
@@ -138,7 +141,12 @@ def pace_here(store: Store, fallback: PipelineConfig, model: CostModel) -> Pace:
         return Pace("history", len(processor), known, model.pace(elapsed, fallback))
     factor = probe_seconds() / model.probe_s
     fitted = [task for task in model.time if not beyond_the_fit(task, fallback)]
-    return Pace("probe", len(processor), dict.fromkeys(fitted, factor), {})
+    rasteriser = probed_rasteriser()
+    if rasteriser == "native":
+        return Pace("probe", len(processor), dict.fromkeys(fitted, factor), {})
+    # How much slower another rasteriser is tells nothing of what does not render.
+    factors = {task: factor if task in RENDERING else 1.0 for task in fitted}
+    return Pace(f"probe of {rasteriser}", len(processor), factors, {})
 
 
 def predict_run(

@@ -85,7 +85,7 @@ def detail_flags(config: PipelineConfig, counts: Mapping[str, Any]) -> str:
     """What asks for frames of that size, on the command line.
 
     Frames that are at least of the source's size can be measured again, whatever they are; smaller ones were
-    measured as they are, and the size is named, beside which a divisor does not count.
+    measured as they are, and the size is named, in place of a divisor.
 
     Args:
         config: settings that they were read with.
@@ -95,7 +95,8 @@ def detail_flags(config: PipelineConfig, counts: Mapping[str, Any]) -> str:
     if given.size != "thumbnail" and given.width is None and given.downscale is None:
         return "--ingest.size detail"
     height = "" if given.height is None else f" --ingest.height {counts['detail_height']}"
-    return f"--ingest.width {counts['detail_width']}{height}"
+    divisor = "" if given.downscale is None else " --ingest.downscale none"
+    return f"--ingest.width {counts['detail_width']}{height}{divisor}"
 
 
 def work_before_reading(

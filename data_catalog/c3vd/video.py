@@ -143,6 +143,12 @@ class Video:
                 frame=without[0],
                 field="depth",
             )
+        if not depth and not flat and depth_folder.is_dir() and any(depth_folder.iterdir()):
+            logger.warning(
+                "%s is not read: no file in it is called NNNN_depth.tiff",
+                depth_folder,
+                extra={"topic": "not read", "field": "depth"},
+            )
         pose_file = folder / POSE_FILE
         poses, layout = read_pose_file(pose_file)
         mesh = folder / "coverage_mesh.obj"

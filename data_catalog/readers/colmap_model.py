@@ -27,15 +27,16 @@ import logging
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from data_catalog.folder_reader import FolderReader
-from data_catalog.images import COLOUR_SUFFIXES, natural_key, save_images
+from data_catalog.images import COLOUR_SUFFIXES, file_key, natural_key, order_for_fingerprint, save_images
 from data_catalog.inside import inside
 from data_catalog.posed_frames import PosedFrame, SourceFrames
+from data_catalog.readers.beside_frames import tell_about_folders
 from data_catalog.readers.colmap_files import (
     ColmapImage,
     ColmapModel,
@@ -179,13 +180,18 @@ def _files(folder: Path) -> list[Path]:
     return sorted({file for file in listed if file.is_file()})
 
 
+def _chosen(folder: Path) -> dict[str, Any]:
+    model = model_folder(folder)
+    return {} if model is None else order_for_fingerprint(read_image_names(model))
+
+
 def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     place = model_folder(folder)
     if place is None:
         raise SourceNotFoundError("no COLMAP model in this folder", file=folder)
     folder = _workspace(folder, place)
     model, pose_file = read_model(place), _pose_file(place)
-    listed = sorted(model.images, key=lambda image: natural_key(image.name))
+    listed = sorted(model.images, key=lambda image: file_key(image.name))
     root, located = _located(folder, [image.name for image in listed], pose_file)
     _tell_about_unposed(root, {item.name for item in located.values()})
     files = {name: item.colour for name, item in located.items()}
@@ -193,7 +199,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     splits = _splits(folder, listed)
     images = [image for image in listed if image.name in present and (not splits or image.name in splits)]
     used = [located[image.name] for image in images]
-    _tell_about_unmasked(folder, used)
+    _tell_what_is_lacking(folder, used)
     folders = [str(Path(item.name).parent) for item in used]
     recordings = sorted(set(folders), key=natural_key)
     frames = [
@@ -229,6 +235,7 @@ READER = FolderReader(
     frames=_frames,
     conventions="COLMAP poses (camera from world, OpenCV axes, inverted on reading), pixel "
     "centres at +0.5; arbitrary unit unless length_unit.txt says mm",
+    chosen=_chosen,
 )
 
 
@@ -422,8 +429,10 @@ def _tell_about_unposed(root: Path, posed: set[str]) -> None:
         )
 
 
-def _tell_about_unmasked(folder: Path, frames: list[_ImageFiles]) -> None:
+def _tell_what_is_lacking(folder: Path, frames: list[_ImageFiles]) -> None:
     if (folder / "masks").is_dir():
         warn_of_unmasked(folder / "masks", {item.name: item.mask for item in frames})
-    elif (folder / "mask").is_dir():
-        logger.warning("%s is not read; masks are looked for in masks/", folder / "mask")
+    else:
+        tell_about_folders(folder, "mask", "masks are looked for in masks/")
+    if all(item.depth is None for item in frames):
+        tell_about_folders(folder, "depth", "depth is looked for in stereo/depth_maps/")

@@ -9,7 +9,8 @@
         masks/*.png             optional, also gt_masks/; of either polarity
 
 Other files in these folders, such as `depth/*.npy`, are not read, which a warning says where there are no
-images beside them.
+images beside them. Images, rows, depth and masks belong together in the order of their names; where the
+numbers in the names contradict that, the clip is refused.
 
 The matrix is LLFF's: columns are the camera's down, right and backward axes, its centre, and (height, width,
 focal length). They become OpenCV's (right, down, forward) on reading; the principal point is the image's
@@ -27,14 +28,16 @@ Source: Wang et al., "Neural rendering for stereo 3D reconstruction of deformabl
 from __future__ import annotations
 
 import logging
+import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from data_catalog.folder_reader import FolderReader
-from data_catalog.images import colour_files, read_colour, read_mask, spread
+from data_catalog.images import colour_files, order_for_fingerprint, read_colour, read_mask, spread
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from extrags.array_files import load_npy
 from extrags.config import IngestConfig
@@ -74,10 +77,12 @@ def _part(folder: Path, names: tuple[str, ...]) -> list[Path]:
 
 
 def _not_read(folder: Path) -> list[str]:
-    """Folders of masks or depth in which there are files, and none of them an image, as sentences."""
+    """Folders of masks or depth that are not read, or hold files of which none is an image, as sentences."""
     said = []
     for field, names in (("masks", _MASK_FOLDERS), ("depth", _DEPTH_FOLDERS)):
-        place = next((folder / name for name in names if (folder / name).is_dir()), None)
+        there = [folder / name for name in names if (folder / name).is_dir()]
+        said += [f"{other.name}/ is not read, only {there[0].name}/" for other in there[1:]]
+        place = next(iter(there), None)
         if place is None or colour_files(place):
             continue
         others = sorted(file.name for file in place.iterdir() if file.is_file() and file.name[0] != ".")
@@ -94,8 +99,19 @@ def _recognises(folder: Path) -> bool:
 
 
 def _files(folder: Path) -> list[Path]:
-    parts = (_part(folder, names) for names in (_IMAGE_FOLDERS, _MASK_FOLDERS, _DEPTH_FOLDERS))
-    return sorted([folder / POSES_FILE, *(file for part in parts for file in part)])
+    images = _part(folder, _IMAGE_FOLDERS)
+    # Here as well: what an earlier version paired wrongly must not be found in a store.
+    masks = _matching(_part(folder, _MASK_FOLDERS), images, "mask")
+    depths = _matching(_part(folder, _DEPTH_FOLDERS), images, "depth")
+    return sorted([folder / POSES_FILE, *images, *masks, *depths])
+
+
+def _chosen(folder: Path) -> dict[str, Any]:
+    orders = [
+        order_for_fingerprint(file.name for file in _part(folder, names))
+        for names in (_IMAGE_FOLDERS, _MASK_FOLDERS, _DEPTH_FOLDERS)
+    ]
+    return next((order for order in orders if order), {})
 
 
 def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
@@ -149,6 +165,7 @@ READER = FolderReader(
     frames=_frames,
     conventions="LLFF camera axes (down, right, backward), camera to world; mm; masks of detected polarity",
     notes=_notes,
+    chosen=_chosen,
 )
 
 
@@ -253,7 +270,12 @@ def polarity_of_images(
 
 
 def _matching(files: list[Path], images: list[Path], field: str) -> list[Path]:
-    """Files of the images, in their order; none at all is allowed."""
+    """Files of the images, in their order; none at all is allowed.
+
+    Raises:
+        SourceNotFoundError: not one for each image.
+        SourceError: the numbers in the names say that a file belongs to another image.
+    """
     if files and len(files) != len(images):
         raise SourceNotFoundError(
             f"{len(files)} files for {len(images)} images; expected one for each image, or no folder",
@@ -261,4 +283,27 @@ def _matching(files: list[Path], images: list[Path], field: str) -> list[Path]:
             frame=images[min(len(files), len(images) - 1)].name,
             field=field,
         )
+    steps = [file - image for file, image in zip(_numbers(files), _numbers(images), strict=False)]
+    apart = next((k for k in range(1, len(steps)) if steps[k] != steps[0]), None)
+    if apart is not None:
+        raise SourceError(
+            f"in the order of names this file would belong to {_below(images[apart])}, and the one before "
+            f"it, {files[apart - 1].name}, to {_below(images[apart - 1])}: their numbers go apart, as where "
+            "a file is missing on either side. Expected numbers that are those of the images, or differ from "
+            "them by a constant",
+            file=files[apart],
+            frame=images[apart].name,
+            field=field,
+        )
     return files
+
+
+def _numbers(files: list[Path]) -> list[int]:
+    """The last number in each name; none where a name has none, or all have one, as a size in pixels."""
+    runs = [re.findall(r"\d+", file.stem) for file in files]
+    numbers = [int(run[-1]) for run in runs if run]
+    return numbers if len(numbers) == len(files) and len(set(numbers)) > 1 else []
+
+
+def _below(file: Path) -> str:
+    return f"{file.parent.name}/{file.name}"

@@ -21,7 +21,7 @@ from data_catalog.footage import Footage, FootageFrame, TimeSpan
 from data_catalog.images import spread
 from data_catalog.interlacing import deinterlaced
 from data_catalog.posed_frames import PosedFrame, SourceFrames
-from data_catalog.readers.frames_folder import INTRINSICS_FILE, mask_beside, read_intrinsics
+from data_catalog.readers.frames_folder import mask_beside, read_intrinsics, stated_intrinsics
 from data_catalog.sampling import Sampling
 from data_catalog.survey import NOTHING_DECODED, Shot, Survey, choose_frames, survey
 from extrags.config import IngestConfig
@@ -109,7 +109,7 @@ def _unread(
         width,
         height,
         pixel_aspect=footage.pixel_aspect,
-        guess_is_used=config.calibration is None,
+        is_used=config.calibration is None,
     )
     lens, mask_file = Lens.pinhole(K, width, height), mask_beside(file.parent)
     return SourceFrames(
@@ -119,7 +119,7 @@ def _unread(
         ],
         pose_file=file,
         metric=False,
-        intrinsics="given" if (file.parent / INTRINSICS_FILE).is_file() else "guessed",
+        intrinsics=stated_intrinsics(file.parent, config),
     )
 
 

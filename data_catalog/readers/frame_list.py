@@ -57,6 +57,16 @@ class FilesBeside:
                 return found
         return None
 
+    def of_any_format(self, stems: Iterable[str | Path]) -> Path | None:
+        """The first file of the first stem that has one, whatever its suffix, as to name what is not read."""
+        for stem in stems:
+            place = self.folder / stem
+            suffixes = [suffix for name, suffix in self._files_of(place.parent) if name == place.name]
+            found = self.find([stem], suffixes)
+            if found is not None:
+                return found
+        return None
+
     def _files_of(self, folder: Path) -> dict[tuple[str, str], Path]:
         """Files directly in a folder by stem and suffix."""
         if folder not in self._listed:

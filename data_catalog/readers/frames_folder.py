@@ -3,15 +3,16 @@
 Images lie in the folder itself, or in `images/` or `rgb/` below it, and are taken in natural order (9 before
 10). Where several of these hold images, those of the one with at least twice as many as any other are taken,
 and the others named in a warning; without such a one the source is refused. Woven (interlaced) images are
-read as they are, with a warning.
+read as they are, with a warning. What is depth or a mask of a frame by its name is left out, and what tells
+of poses is not read, both with a warning (`data_catalog.readers.beside_frames`).
 
 Optional beside them: `intrinsics.json` with `K` (3 x 3), or `fx`, `fy`, `cx`, `cy`, or `field_of_view_deg`
 (horizontal), in pixels of the files with centres at +0.5, of a pinhole; and `mask.png` (white is tissue).
 Without intrinsics a horizontal field of view of 90 degrees is assumed, and said so in the log: the sequence's
 intrinsics are `guessed`, and the poses stage estimates them, lens distortion included. A calibration file
-(`ingest.calibration`) may stand in for both. Without a mask, the dark frame round the picture is found from
-all frames: dark everywhere, always, and joined to the image border; so are a round picture and burnt-in text
-(`data_catalog.content`).
+(`ingest.calibration`) takes the place of both, and `intrinsics.json` is then not read. Without a mask, the
+dark frame round the picture is found from all frames: dark everywhere, always, and joined to the image
+border; so are a round picture and burnt-in text (`data_catalog.content`).
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from __future__ import annotations
 import json
 import logging
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -29,10 +30,24 @@ from data_catalog.content import content_mask, looked_at
 from data_catalog.folder_reader import FolderReader
 from data_catalog.footage import DICOM_SUFFIXES, VIDEO_SUFFIXES, files_of_kind
 from data_catalog.guessed_intrinsics import ASSUMED_FIELD_OF_VIEW_DEG, intrinsics_of_field_of_view
-from data_catalog.images import check_links, image_entries, image_size, read_colour, spread
+from data_catalog.images import (
+    check_links,
+    image_entries,
+    image_size,
+    order_for_fingerprint,
+    read_colour,
+    spread,
+)
 from data_catalog.interlacing import is_combed, is_interlaced
 from data_catalog.lens_entries import check_pinhole
 from data_catalog.posed_frames import PosedFrame, SourceFrames
+from data_catalog.readers.beside_frames import (
+    check_one_format,
+    frames_among,
+    listed_files,
+    tell_about_pictures,
+    tell_what_is_not_read,
+)
 from data_catalog.sampling import Sampling
 from extrags.config import IngestConfig
 from extrags.errors import SourceError, SourceNotFoundError
@@ -44,10 +59,10 @@ __all__ = [
     "MASK_FILE",
     "READER",
     "is_mask",
-    "listed_files",
     "mask_beside",
     "places_with_frames",
     "read_intrinsics",
+    "stated_intrinsics",
 ]
 
 logger = logging.getLogger(__name__)
@@ -58,7 +73,6 @@ FEWEST_FRAMES = 4
 """Fewer stills beside a video are pictures about it: poses could not be estimated from them."""
 _CLEARLY_MORE = 2
 _LOOKED_AT_FOR_COMBS = 12
-_NAMED_FILES = 3
 _SIZES = (("width", "height"), ("w", "h"))
 
 
@@ -91,21 +105,19 @@ def places_with_frames(folder: Path) -> dict[Path, list[Path]]:
     Links to nothing are among them: which place is meant does not depend on whether its files are there.
     """
     places = [place for place in (folder, folder / "images", folder / "rgb") if place.is_dir()]
-    found = {place: [file for file in image_entries(place) if not is_mask(file)] for place in places}
+    found = {place: frames_among(_pictures(place))[0] for place in places}
     return {place: found[place] for place in sorted(found, key=lambda at: -len(found[at])) if found[place]}
 
 
-def listed_files(files: list[Path]) -> str:
-    """The names of some files, the first ones where there are many."""
-    more = f" and {len(files) - _NAMED_FILES} more" if len(files) > _NAMED_FILES else ""
-    return ", ".join(file.name for file in files[:_NAMED_FILES]) + more
+def _pictures(place: Path) -> list[Path]:
+    return [file for file in image_entries(place) if not is_mask(file)]
 
 
 def _images(folder: Path) -> list[Path]:
     """The frames to read; none where there are none.
 
     Raises:
-        SourceError: several places hold about as many.
+        SourceError: several places hold about as many, or one frame is there in two formats.
         SourceNotFoundError: one of the frames is a link to a file that is not there.
     """
     found = places_with_frames(folder)
@@ -118,6 +130,7 @@ def _images(folder: Path) -> list[Path]:
             f"{told}; give the path of the folder to read, or move away what is not to be read", file=folder
         )
     check_links(files)
+    check_one_format(files)
     return files
 
 
@@ -138,7 +151,7 @@ def _footage(folder: Path) -> list[Path]:
 
 
 def _tell_what_is_passed_over(folder: Path, files: list[Path]) -> None:
-    """Warn of images elsewhere in a folder, and of videos."""
+    """Warn of images elsewhere in a folder, of pictures that are no frames, and of what else lies there."""
     for place, others in places_with_frames(folder).items():
         if place != files[0].parent:
             logger.warning(
@@ -149,6 +162,8 @@ def _tell_what_is_passed_over(folder: Path, files: list[Path]) -> None:
                 len(files),
                 _said(files[0].parent, folder),
             )
+    tell_about_pictures(folder, frames_among(_pictures(files[0].parent))[1])
+    tell_what_is_not_read(folder)
     if footage := _footage(folder):
         logger.warning(
             "%s: %d images are read, and not %s; give its path to read that instead",
@@ -169,20 +184,16 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
         raise SourceNotFoundError("no image in this folder", file=folder)
     _tell_what_is_passed_over(folder, files)
     width, height = image_size(files[0], frame=files[0].name)
-    K = read_intrinsics(folder, width, height, guess_is_used=config.calibration is None)
+    K = read_intrinsics(folder, width, height, is_used=config.calibration is None)
     lens = Lens.pinhole(K, width, height)
     mask_file = mask_beside(folder, files[0].parent)
-    if mask_file is None:
-        for place in (folder / "mask", folder / "masks"):
-            if place.is_dir():
-                logger.warning("%s is not read; of plain frames, one mask.png holds for all", place)
     return SourceFrames(
         frames=[PosedFrame(file.name, file, lens, mask_file=mask_file) for file in files],
         pose_file=folder,
         metric=False,
         read_colour=_Images(folder, [files[k] for k in spread(len(files), config.max_frames)]).image,
         masks=_ContentMask(),
-        intrinsics="given" if (folder / INTRINSICS_FILE).is_file() else "guessed",
+        intrinsics=stated_intrinsics(folder, config),
     )
 
 
@@ -242,11 +253,18 @@ READER = FolderReader(
     files=_files,
     frames=_frames,
     conventions="no poses and no depth; the poses stage finds them, in an arbitrary unit",
+    chosen=lambda folder: order_for_fingerprint(file.name for file in _images(folder)),
 )
 
 
+def stated_intrinsics(folder: Path, config: IngestConfig) -> Literal["given", "guessed"]:
+    """Whether `intrinsics.json` tells the lens of frames beside it; a calibration file comes before it."""
+    is_read = config.calibration is None and (folder / INTRINSICS_FILE).is_file()
+    return "given" if is_read else "guessed"
+
+
 def read_intrinsics(
-    folder: Path, width: int, height: int, *, pixel_aspect: float = 1.0, guess_is_used: bool = True
+    folder: Path, width: int, height: int, *, pixel_aspect: float = 1.0, is_used: bool = True
 ) -> Float[np.ndarray, "3 3"]:
     """K from `intrinsics.json` in a folder, or of the assumed field of view where there is none.
 
@@ -255,15 +273,18 @@ def read_intrinsics(
         width: of the images it belongs to, in pixels.
         height: of the images it belongs to, in pixels.
         pixel_aspect: width of a pixel over its height, for intrinsics from a field of view.
-        guess_is_used: whether to warn of the assumed field of view; false where a calibration file follows.
+        is_used: false where a calibration file takes the place of the result: nothing is read then, nor
+            warned of.
 
     Raises:
         SourceError: the file is damaged or describes no pinhole.
     """
     file = folder / INTRINSICS_FILE
-    if not file.is_file():
+    if not is_used and file.is_file():
+        logger.info("%s is not read: ingest.calibration takes its place", file)
+    if not is_used or not file.is_file():
         logger.log(
-            logging.WARNING if guess_is_used else logging.DEBUG,
+            logging.WARNING if is_used else logging.DEBUG,
             "%s has no intrinsics.json: assuming a horizontal field of view of %g degrees, until the poses "
             "stage estimates it",
             folder.name,

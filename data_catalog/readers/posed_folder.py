@@ -45,10 +45,17 @@ from typing import Any
 
 from data_catalog.checks import check_intrinsics
 from data_catalog.folder_reader import FolderReader
-from data_catalog.images import COLOUR_SUFFIXES, colour_files, image_size
+from data_catalog.images import (
+    COLOUR_SUFFIXES,
+    DEPTH_SUFFIXES,
+    colour_files,
+    depth_suffixes_in_words,
+    image_size,
+)
 from data_catalog.inside import inside
 from data_catalog.lens_entries import check_pinhole
 from data_catalog.posed_frames import PosedFrame, SourceFrames
+from data_catalog.readers.beside_frames import tell_about_folders
 from data_catalog.readers.frame_list import FilesBeside, load_frame_list, matrix_of, warn_of_unmasked
 from data_catalog.readers.unknown_keys import warn_of_unknown_keys
 from extrags.config import IngestConfig
@@ -60,7 +67,6 @@ __all__ = ["POSES_FILE", "READER"]
 logger = logging.getLogger(__name__)
 
 POSES_FILE = "poses.json"
-_DEPTH_SUFFIXES = (".npy", ".tiff", ".tif", ".png")
 _LENGTH_UNITS = ("mm", "arbitrary")
 _KEYS = ("frames", "K", "length_unit")
 _KEYS_OF_FRAMES = ("file", "world_from_camera", "K", "split", "recording")
@@ -79,9 +85,7 @@ def _files(folder: Path) -> list[Path]:
     content = _load(folder)
     # Absent images are refused on reading; nothing is read beside them.
     names = [entry["file"] for entry in content["frames"] if (folder / entry["file"]).is_file()]
-    beside = _beside(folder, "depth", names, _DEPTH_SUFFIXES) + _beside(
-        folder, "mask", names, COLOUR_SUFFIXES
-    )
+    beside = _beside(folder, "depth", names, DEPTH_SUFFIXES) + _beside(folder, "mask", names, COLOUR_SUFFIXES)
     found = {folder / POSES_FILE, *(folder / name for name in names), *(file for file in beside if file)}
     return sorted(found)
 
@@ -184,8 +188,8 @@ def _beside(folder: Path, part: str, names: list[str], suffixes: tuple[str, ...]
     owner: dict[Path, str] = {}
     files = FilesBeside(folder / part)
     for name in names:
-        inner = Path(name).relative_to("rgb") if Path(name).is_relative_to("rgb") else Path(name)
-        file = files.find(dict.fromkeys((inner.with_suffix(""), Path(inner.stem))), suffixes)
+        inner = _below_rgb(name)
+        file = files.find(_stems(inner), suffixes)
         if file is not None and owner.setdefault(file, name) != name:
             raise SourceError(
                 f"this file would belong to {owner[file]} as well; expected one for each at the path of its "
@@ -198,15 +202,32 @@ def _beside(folder: Path, part: str, names: list[str], suffixes: tuple[str, ...]
     return found
 
 
+def _below_rgb(name: str) -> Path:
+    return Path(name).relative_to("rgb") if Path(name).is_relative_to("rgb") else Path(name)
+
+
+def _stems(inner: Path) -> list[Path]:
+    return list(dict.fromkeys((inner.with_suffix(""), Path(inner.stem))))
+
+
 def _depth_files(folder: Path, names: list[str]) -> list[Path | None]:
     if not (folder / "depth").is_dir():
+        tell_about_folders(folder, "depth", "depth is looked for in depth/")
         return [None] * len(names)
-    found = _beside(folder, "depth", names, _DEPTH_SUFFIXES)
+    found = _beside(folder, "depth", names, DEPTH_SUFFIXES)
     for name, file in zip(names, found, strict=True):
         if file is None:
+            other = FilesBeside(folder / "depth").of_any_format(_stems(_below_rgb(name)))
+            if other is not None:
+                raise SourceError(
+                    f"depth of this format is not read; expected {depth_suffixes_in_words()}",
+                    file=other,
+                    frame=name,
+                    field="depth",
+                )
             raise SourceNotFoundError(
                 "no depth for this frame; expected it for all frames, or no folder depth/ at all",
-                file=folder / "depth" / f"{Path(name).stem}{_DEPTH_SUFFIXES[0]}",
+                file=folder / "depth" / f"{Path(name).stem}{DEPTH_SUFFIXES[0]}",
                 frame=name,
                 field="depth",
             )
@@ -215,8 +236,7 @@ def _depth_files(folder: Path, names: list[str]) -> list[Path | None]:
 
 def _mask_files(folder: Path, names: list[str]) -> list[Path | None]:
     if not (folder / "mask").is_dir():
-        if (folder / "masks").is_dir():
-            logger.warning("%s is not read; masks are looked for in mask/", folder / "masks")
+        tell_about_folders(folder, "mask", "masks are looked for in mask/")
         return [None] * len(names)
     found = _beside(folder, "mask", names, COLOUR_SUFFIXES)
     warn_of_unmasked(folder / "mask", dict(zip(names, found, strict=True)))

@@ -46,12 +46,14 @@ _MIRROR = np.diag([1.0, -1.0, 1.0])
 
 
 def _recognises(folder: Path) -> bool:
-    return any(folder.glob("SavedPosition*.txt")) and any(folder.glob("FrameBuffer_*.png"))
+    # Without its poses as well: depth would otherwise be taken for more frames.
+    others = any(folder.glob("SavedPosition*.txt")) or any(folder.glob("Depth_*.png"))
+    return others and any(folder.glob("FrameBuffer_*.png"))
 
 
 def _files(folder: Path) -> list[Path]:
-    patterns = ("FrameBuffer_*.png", "Depth_*.png", "SavedPosition*.txt", "SavedRotationQuaternion*.txt")
-    return sorted(file for pattern in patterns for file in folder.glob(pattern))
+    frames = [file for pattern in ("FrameBuffer_*.png", "Depth_*.png") for file in folder.glob(pattern)]
+    return sorted([*frames, *_pose_files(folder)])
 
 
 def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
@@ -140,11 +142,11 @@ def read_poses(folder: Path) -> Float[np.ndarray, "f 4 4"]:
     """`world_from_camera` in OpenCV axes and mm, one for each line of the pose files.
 
     Raises:
-        PoseError: the two files differ in length, or a line is no pose.
+        PoseError: the two files differ in length or belong to different sequences, there are several of a
+            kind, or a line is no pose.
         SourceNotFoundError: a pose file is missing.
     """
-    position_file = _pose_file(folder, "SavedPosition")
-    rotation_file = _pose_file(folder, "SavedRotationQuaternion")
+    position_file, rotation_file = _pose_files(folder)
     positions = _numbers(position_file, 3)
     quaternions = _numbers(rotation_file, 4)
     if len(positions) != len(quaternions):
@@ -162,10 +164,38 @@ def read_poses(folder: Path) -> Float[np.ndarray, "f 4 4"]:
     return np.stack(poses)
 
 
+def _pose_files(folder: Path) -> tuple[Path, Path]:
+    """The positions and the rotations of one sequence."""
+    position_file = _pose_file(folder, "SavedPosition")
+    rotation_file = _pose_file(folder, "SavedRotationQuaternion")
+    of_positions, of_rotations = (
+        file.stem.removeprefix(start)
+        for file, start in ((position_file, "SavedPosition"), (rotation_file, "SavedRotationQuaternion"))
+    )
+    if of_positions != of_rotations:
+        raise PoseError(
+            f"the rotations beside it are {rotation_file.name}, by its name of another sequence",
+            file=position_file,
+            field="world_from_camera",
+        )
+    return position_file, rotation_file
+
+
 def _pose_file(folder: Path, start: str) -> Path:
     found = sorted(folder.glob(f"{start}*.txt"))
     if not found:
-        raise SourceNotFoundError("no such file", file=folder / f"{start}_*.txt")
+        raise SourceNotFoundError(
+            "no such file, though there are frames of SimCol3D (FrameBuffer_NNNN.png); expected the poses of "
+            "all. To have them estimated, give FrameBuffer_NNNN.png alone a folder of their own",
+            file=folder / f"{start}_*.txt",
+            field="world_from_camera",
+        )
+    if len(found) > 1:
+        raise PoseError(
+            f"beside {found[0].name}, and nothing tells which of them belongs to these frames; expected one",
+            file=found[1],
+            field="world_from_camera",
+        )
     return found[0]
 
 

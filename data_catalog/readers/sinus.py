@@ -108,9 +108,17 @@ READER = FolderReader(
 
 
 def read_view_names(folder: Path) -> list[str]:
-    """Names of the frames, in the order of the poses."""
-    text = _text(folder / "visible_view_indexes")
-    return [f"{int(line):08d}" for line in text.split()]
+    """Names of the frames, in the order of the poses.
+
+    Raises:
+        SourceError: a view that is listed twice.
+    """
+    file = folder / "visible_view_indexes"
+    names = [f"{int(line):08d}" for line in _text(file).split()]
+    twice = next((name for index, name in enumerate(names) if name in names[:index]), None)
+    if twice is not None:
+        raise SourceError("the view is listed twice", file=file, frame=twice, field="frames")
+    return names
 
 
 def read_poses(folder: Path) -> Float[np.ndarray, "f 4 4"]:
@@ -165,6 +173,13 @@ def _lens(folder: Path, width: int, height: int) -> Lens:
     values = [float(value) for value in _text(file).split()]
     if len(values) < 4:
         raise SourceError(f"{len(values)} numbers; expected fx, fy, cx, cy", file=file, field="K")
+    if len(values) % 4 or values != values[:4] * (len(values) // 4):
+        raise SourceError(
+            f"{len(values)} numbers, which are not fx, fy, cx, cy over and over; expected one camera for all "
+            "views",
+            file=file,
+            field="K",
+        )
     lens = Lens("PINHOLE", tuple(values[:4]), width, height)
     check_intrinsics(lens.K, width, height, file=file)
     return lens

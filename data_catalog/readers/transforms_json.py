@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import json
 import logging
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -31,9 +32,19 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from data_catalog.folder_reader import FolderReader
-from data_catalog.images import COLOUR_SUFFIXES, image_size, natural_key, read_depth, save_images
+from data_catalog.images import (
+    COLOUR_SUFFIXES,
+    file_key,
+    image_entries,
+    image_size,
+    natural_key,
+    order_for_fingerprint,
+    read_depth,
+    save_images,
+)
 from data_catalog.inside import inside
 from data_catalog.posed_frames import PosedFrame, SourceFrames
+from data_catalog.readers.beside_frames import frames_among, listed_files, tell_about_folders
 from data_catalog.readers.frame_list import listed_split, load_frame_list, matrix_of, present_frames
 from data_catalog.readers.unknown_keys import warn_of_unknown_keys
 from extrags.array_files import load_ply_vertices
@@ -98,6 +109,10 @@ def _files(folder: Path) -> list[Path]:
     return sorted(file for file in found if file.is_file())
 
 
+def _chosen(folder: Path) -> dict[str, Any]:
+    return order_for_fingerprint(entry["file_path"] for entry in _load(folder / TRANSFORMS_FILE)["frames"])
+
+
 def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     file = folder / TRANSFORMS_FILE
     content = _load(file)
@@ -112,11 +127,12 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
         content, known=_KEYS, known_of_frames=_KEYS, frame_name="file_path", file=file, others=_OTHER_KEYS
     )
     scale = _MM_PER_UNIT[unit]
-    listed = sorted(content["frames"], key=lambda entry: natural_key(entry["file_path"]))
+    listed = sorted(content["frames"], key=lambda entry: file_key(entry["file_path"]))
     files = {}
     for entry in listed:
         name = entry["file_path"]
         files[name] = _with_suffix(inside(folder, name, file=file, frame=name, field="file_path"))
+    _check_apart(files, "file_path", "the image is listed twice, as {}", file)
     present = present_frames(files, config.max_absent_share, listing=file)
     splits = _splits(content, file)
     used = present & splits.keys() if splits else present
@@ -138,6 +154,13 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
                 split=splits.get(frame),
             )
         )
+    depths = {frame.name: frame.depth_file for frame in frames if frame.depth_file is not None}
+    _check_apart(depths, "depth_file_path", "the depth of {} as well; expected one file for each frame", file)
+    if not depths:
+        tell_about_folders(folder, "depth", "no frame names a file in it (depth_file_path)")
+    if not any(frame.mask_file for frame in frames):
+        tell_about_folders(folder, "mask", "no frame names a file in it (mask_path)")
+    _tell_about_unlisted(file, frames, files.values())
     points, points_rgb = _points(folder, content, file)
 
     def depth_of(depth_file: Path, frame: str | int) -> Float[np.ndarray, "h w"]:
@@ -165,6 +188,7 @@ READER = FolderReader(
     frames=_frames,
     conventions="OpenGL camera axes (y up, z backward, turned on reading), camera to world; "
     "depth in thousandths of the pose unit unless it says otherwise",
+    chosen=_chosen,
 )
 
 
@@ -232,6 +256,35 @@ def _with_suffix(file: Path) -> Path:
         return file
     candidates = (file.with_name(file.name + suffix) for suffix in COLOUR_SUFFIXES)
     return next((candidate for candidate in candidates if candidate.is_file()), file)
+
+
+def _check_apart(files: Mapping[str, Path], field: str, problem: str, file: Path) -> None:
+    """Refuse a file that two frames name, by whatever path.
+
+    Raises:
+        SourceError: names the second frame.
+    """
+    owner: dict[Path, str] = {}
+    for frame, place in files.items():
+        first = owner.setdefault(place, frame)
+        if first != frame:
+            raise SourceError(problem.format(first), file=file, frame=frame, field=field)
+
+
+def _tell_about_unlisted(file: Path, frames: list[PosedFrame], listed: Collection[Path]) -> None:
+    """Warn of images beside those of the frames that the file does not list."""
+    known = {*listed, *(place for frame in frames for place in (frame.mask_file, frame.depth_file) if place)}
+    places = sorted({frame.file.parent for frame in frames})
+    beside = [image for place in places for image in frames_among(image_entries(place))[0]]
+    unlisted = [image for image in beside if image not in known]
+    if unlisted:
+        logger.warning(
+            "%s: %d of %d images beside those of its frames are not listed, and left out: %s",
+            file,
+            len(unlisted),
+            len(beside),
+            listed_files(unlisted),
+        )
 
 
 def _beside(folder: Path, entry: dict[str, Any], key: str, frame: str) -> Path | None:

@@ -28,13 +28,13 @@ from data_catalog.folder_reader import FolderReader
 from data_catalog.footage import VIDEO_SUFFIXES, FootageFrame, TimeSpan, files_of_kind
 from data_catalog.images import image_entries
 from data_catalog.posed_frames import SourceFrames
+from data_catalog.readers.beside_frames import listed_files, tell_what_is_not_read
 from data_catalog.readers.footage_frames import footage_frames, footage_outline
 from data_catalog.readers.frames_folder import (
     FEWEST_FRAMES,
     INTRINSICS_FILE,
     MASK_FILE,
     is_mask,
-    listed_files,
     places_with_frames,
 )
 from extrags.config import IngestConfig
@@ -72,6 +72,15 @@ class VideoFile:
         self._stream = file
         self._file = named or file
         with _opened(self._stream, self._file) as (container, stream):
+            others = [other for other in container.streams.video if other != stream and not _is_cover(other)]
+            if others:
+                logger.warning(
+                    "%s: %d streams of pictures, as of two cameras; the first is read. To read another, "
+                    "give it in a file of its own",
+                    self._file,
+                    1 + len(others),
+                    extra={"topic": "not read", "field": "streams"},
+                )
             self._frames_per_s = float(stream.average_rate or stream.guessed_rate or 0)
             self._start_s = float(stream.start_time * stream.time_base) if stream.start_time else 0.0
             # Of some containers the time before the first frame is part of the duration. Of the others this
@@ -184,7 +193,7 @@ def only_file(place: Path, suffixes: tuple[str, ...]) -> Path | None:
 
 
 def tell_about_stills(place: Path, file: Path) -> None:
-    """Warn of the few pictures that lie beside a footage and are not read.
+    """Warn of the few pictures, and of poses, depth and masks, that lie beside a footage and are not read.
 
     Args:
         place: the folder that was given, or the footage itself, beside which nothing is looked for.
@@ -195,6 +204,7 @@ def tell_about_stills(place: Path, file: Path) -> None:
     """
     if place == file:
         return
+    tell_what_is_not_read(place)
     for folder, stills in places_with_frames(place).items():
         if len(stills) >= FEWEST_FRAMES:
             raise SourceError(
@@ -264,11 +274,19 @@ def _opened(file: Path, named: Path) -> Iterator[tuple[Any, Any]]:
         # Metadata that are no text fail in the binding.
         raise SourceError(problem, file=named) from error
     with container:
-        if not container.streams.video:
+        # A cover is a stream of a single picture.
+        moving = [stream for stream in container.streams.video if not _is_cover(stream)]
+        if not moving:
             raise SourceError("no stream of pictures in it, only sound?", file=named)
-        stream = container.streams.video[0]
+        stream = moving[0]
         stream.thread_type = "AUTO"
         yield container, stream
+
+
+def _is_cover(stream: Any) -> bool:
+    from av.stream import Disposition
+
+    return bool(stream.disposition & Disposition.attached_pic)
 
 
 def _colours(frame: Any) -> UInt8[np.ndarray, "h w 3"]:

@@ -49,7 +49,7 @@ class IngestConfig(StageConfig):
         None,
         ge=1,
         le=16,
-        description="divide the source's size by this; None: as ingest.size says; ignored when width is set",
+        description="divide the source's size by this; None: as ingest.size says; not together with width",
     )
     size: Literal["thumbnail", "source", "central", "detail"] = Field(
         "thumbnail",

@@ -212,7 +212,11 @@ def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig | None = No
             report["n_train"],
         )
         return _by_depth(sequence, config, report)
-    raise CaptureError(failure_message(sequence.name, report, config.min_registered_share, instead=instead))
+    raise CaptureError(
+        failure_message(
+            sequence.name, report, config.min_registered_share, width=sequence.width, instead=instead
+        )
+    )
 
 
 def _job(sequence: EndoscopicSequence, config: PosesConfig, *, unknown_lens: bool = False) -> PoseJob:
@@ -350,6 +354,7 @@ def _by_depth(
                 sequence.name,
                 failed,
                 config.min_registered_share,
+                width=sequence.width,
                 instead="Alignment by depth failed as well.",
             )
             message = f"{because} {message}"

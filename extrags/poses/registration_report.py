@@ -151,13 +151,14 @@ def expected_frames(min_share: float, report: dict[str, Any]) -> str:
     return f"at least {min_share:.0%}" + (f" and {MIN_TRAINING_FRAMES} frames" if few and enough else "")
 
 
-def failure_message(name: str, report: dict[str, Any], min_share: float, *, instead: str) -> str:
+def failure_message(name: str, report: dict[str, Any], min_share: float, *, width: int, instead: str) -> str:
     """Why too few training frames have a pose, and what to do, in sentences.
 
     Args:
         name: of the sequence.
         report: from `colmap_report`.
         min_share: what was expected.
+        width: of the frames, in pixels.
         instead: why nothing else steps in, as a sentence.
     """
     share = report["registered_train"] / max(1, report["n_train"])
@@ -172,18 +173,19 @@ def failure_message(name: str, report: dict[str, Any], min_share: float, *, inst
         f"{report['pairs_turn_only']} of {report['pairs_examined']}; frames per model: "
         f"{', '.join(map(str, report['model_sizes'])) or 'none'}.",
         f"Without a pose: {_named(report['unregistered_train'])}.",
-        _advice(report),
+        _advice(report, width),
         instead,
     ]
     return " ".join(parts)
 
 
-def _advice(report: dict[str, Any]) -> str:
+def _advice(report: dict[str, Any], width: int) -> str:
     """The first quantity that is insufficient, and how to improve it."""
     if report["features_median"] < FEW_FEATURES:
         return (
-            "There is little texture: lower poses.peak_threshold, give larger images (ingest.downscale) "
-            "or check that the mask does not hide the tissue."
+            f"There is little texture: lower poses.peak_threshold, read larger images than of {width} pixels "
+            "in width, if the source is larger (whichever of ingest.width, ingest.downscale and ingest.size "
+            "sets their size), or check that the mask does not hide the tissue."
         )
     frames = list(report["frames"].values())
     weak = sum(frame["best_pair_inliers"] < FEW_INLIERS for frame in frames)

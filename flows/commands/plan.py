@@ -160,9 +160,14 @@ def print_prediction(predicted: RunPrediction, whole: RunPrediction | None = Non
         table.add_row(stage, *texts)
     out = console()
     out.print(table)
+    rasteriser = predicted.source.removeprefix("probe of ")
     sources = {
         "history": f"at the pace of {predicted.records} records in this store",
         "probe": "at the speed that a short probe of this machine has shown; elapsed time is not predicted",
     }
+    slow = (
+        f"the compiled kernels are missing: rendering at the speed that a short probe of the {rasteriser} "
+        "rasteriser has shown, all else as on the reference machine"
+    )
     unknown = f"; not known: {', '.join(predicted.unknown)}" if predicted.unknown else ""
-    out.print(f"[dim]{sources[predicted.source]}{unknown}[/]", soft_wrap=True)
+    out.print(f"[dim]{sources.get(predicted.source, slow)}{unknown}[/]", soft_wrap=True)

@@ -38,6 +38,27 @@ def write_coded(file: Path, frames: np.ndarray, codec: str, **options: str) -> P
     return file
 
 
+def write_streams(file: Path, streams: Sequence[np.ndarray], *, cover_first: bool = False) -> Path:
+    """Several streams of pictures in one file; the first a cover where that is asked for."""
+    import av
+    from av.stream import Disposition
+
+    with av.open(str(file), "w") as container:
+        coded = []
+        for frames in streams:
+            stream = container.add_stream("mjpeg", rate=25)
+            stream.height, stream.width = frames.shape[1:3]
+            stream.pix_fmt = "yuvj420p"
+            coded.append(stream)
+        if cover_first:
+            coded[0].disposition = Disposition.attached_pic
+        for frames, stream in zip(streams, coded, strict=True):
+            for image in frames:
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(image)))
+            container.mux(stream.encode())
+    return file
+
+
 def write_flagged(file: Path, woven: np.ndarray) -> Path:
     """MPEG-2 whose header says that it is interlaced, as recorders write it."""
     return write_coded(file, woven, "mpeg2video", flags="+ildct+ilme")

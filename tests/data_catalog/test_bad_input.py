@@ -46,6 +46,16 @@ class TestFolder:
         with pytest.raises(SourceNotFoundError, match=r"frame rgb/0004\.png, field depth"):
             read(posed_folder)
 
+    def test_depth_of_a_format_that_is_not_read(self, posed_folder) -> None:
+        """It was said to be missing."""
+        for file in (posed_folder / "depth").iterdir():
+            file.rename(file.with_suffix(".exr"))
+        with pytest.raises(
+            SourceError,
+            match=r"0000\.exr, frame rgb/0000\.png, field depth: depth of this format is not read",
+        ):
+            read(posed_folder)
+
     def test_wrong_pose_count(self, posed_folder, edit_poses) -> None:
         edit_poses(lambda content: content["frames"].pop(6))
         with pytest.raises(PoseError, match="9 poses for 10 images") as caught:

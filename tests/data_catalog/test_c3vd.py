@@ -45,6 +45,12 @@ def video(pristine: Written, tmp_path: Path) -> Path:
 
 
 class TestLayouts:
+    def test_depth_by_other_names_is_told_of(self, video: Path, caplog: pytest.LogCaptureFixture) -> None:
+        for file in (video / "depth").iterdir():
+            file.rename(file.with_name(file.name.replace("_depth", "")))
+        assert read(video, SMALL).depth_mm is None
+        assert "depth is not read: no file in it is called NNNN_depth.tiff" in caplog.text
+
     def test_c3vdv2(self, pristine: Written) -> None:
         sequence = read(pristine.folder, SMALL)
         assert sequence.rgb.shape == (12, 36, 45, 3)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from data_catalog import read, resolve, source_fingerprint
+from data_catalog import glance, read, resolve, source_fingerprint
 from data_catalog.c3vd.scaramuzza import ScaramuzzaCamera
 from data_catalog.calibration_files import read_calibration
 from data_catalog.readers import frames_folder
@@ -413,15 +413,24 @@ class TestPlainFrames:
         with pytest.raises(SourceError, match=r"its content is not understood \(KeyError: 'entry'\)"):
             read(found, config)
 
-    def test_not_beside_intrinsics_that_are_stated(self, plain_frames, tmp_path) -> None:
+    @pytest.mark.parametrize(
+        "stated", ['{"field_of_view_deg": 80}', '{"fx": 90, "k1": -0.3}', '{"fx": 90}', "[damaged"]
+    )
+    def test_it_takes_the_place_of_intrinsics_beside_the_frames(self, plain_frames, tmp_path, stated) -> None:
+        """Of a lens with distortion, the advice was this setting, and the same error came again."""
         config = IngestConfig(calibration=str(opencv_file(tmp_path / "a.yml", [0.1, 0, 0, 0])))
-        stated = plain_frames / "intrinsics.json"
-        stated.write_text('{"field_of_view_deg": 80}')
+        expected = read(plain_frames, config).K
+        file = plain_frames / "intrinsics.json"
+        file.write_text(stated)
         try:
-            assert read(plain_frames).intrinsics == "given"
-            with pytest.raises(ConfigError, match="states its intrinsics itself"):
-                read(plain_frames, config)
+            found = read(plain_frames, config)
+            assert glance(plain_frames, config).width == WIDTH
         finally:
-            stated.unlink()
+            file.unlink()
+        assert found.intrinsics == "given"
+        np.testing.assert_array_equal(found.K, expected)
+
+    def test_not_for_a_source_that_states_its_intrinsics(self, tmp_path) -> None:
+        config = IngestConfig(calibration=str(opencv_file(tmp_path / "a.yml", [0.1, 0, 0, 0])))
         with pytest.raises(ConfigError, match="phantom/3@sparse states its intrinsics itself"):
             read("phantom/3@sparse", config)

@@ -258,6 +258,19 @@ class TestFingerprint:
         assert source_fingerprint(posed_folder) == before
 
 
+def test_a_size_is_given_once(posed_folder) -> None:
+    """A divisor beside a width was passed over."""
+    both = IngestConfig(width=32, downscale=2)
+    expected = (
+        r"ingest\.width = 32 and ingest\.downscale = 2 both set the size of frames; give one of the two"
+    )
+    for function in (read, glance, source_fingerprint):
+        with pytest.raises(ConfigError, match=expected):
+            function(posed_folder, both)
+        with pytest.raises(ConfigError, match=expected):
+            function("phantom/3@sparse", both)
+
+
 def test_source_survives_pickling() -> None:
     source = resolve("phantom/2@distanced")
     assert pickle.loads(pickle.dumps(source)) == source

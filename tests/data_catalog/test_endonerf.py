@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from data_catalog.catalog import read, resolve
+from data_catalog.catalog import read, resolve, source_fingerprint
 from data_catalog.inspection import inspect
 from data_catalog.readers.endonerf import mask_polarity, polarity_of_images
 from extrags.errors import SourceError
@@ -45,6 +45,50 @@ def test_arrays_in_place_of_images_are_told_of(clip, tmp_path, caplog, part) -> 
     told = f"{part}/ holds no images, and what it holds is not read (10 files, the first is 0000.npy)"
     assert caplog.text.count(told) == 1
     assert any(told in note for note in inspect(tmp_path).notes)
+
+
+class TestNumbersOfNames:
+    """Depth and masks were paired by their order alone."""
+
+    def written(self, clip, folder, part) -> None:
+        sequence, tool = with_tool(clip)
+        write_endonerf(sequence, folder, tool)
+        for other in {"depth", "masks"} - {part}:
+            shutil.rmtree(folder / other)
+
+    @pytest.mark.parametrize("part", ["depth", "masks"])
+    def test_a_hole_on_either_side_is_refused(self, clip, tmp_path, part) -> None:
+        self.written(clip, tmp_path, part)
+        (tmp_path / "images" / "frame-000003.png").unlink()
+        (tmp_path / part / "frame-000007.png").unlink()
+        rows = np.load(tmp_path / "poses_bounds.npy")
+        np.save(tmp_path / "poses_bounds.npy", np.delete(rows, 3, axis=0))
+        field = "mask" if part == "masks" else part
+        with pytest.raises(
+            SourceError,
+            match=rf"{part}/frame-000003\.png, frame frame-000004\.png, field {field}: .* would belong to "
+            r"images/frame-000004\.png, and the one before it, frame-000002\.png, to",
+        ):
+            read(tmp_path)
+        # Nor is what was made of it before.
+        with pytest.raises(SourceError, match="their numbers go apart"):
+            source_fingerprint(tmp_path)
+
+    def test_a_file_too_many_and_one_missing_are_refused(self, clip, tmp_path) -> None:
+        self.written(clip, tmp_path, "depth")
+        (tmp_path / "depth" / "frame-000005.png").rename(tmp_path / "depth" / "frame-000000a.png")
+        with pytest.raises(SourceError, match=r"depth/frame-000000a\.png, frame frame-000001\.png"):
+            read(tmp_path)
+
+    @pytest.mark.parametrize("renamed", ["{}.depth", "depth-{}", "0007_{}_96", "{}_77", "d"])
+    def test_names_may_differ_otherwise(self, clip, tmp_path, renamed) -> None:
+        self.written(clip, tmp_path, "depth")
+        expected = read(tmp_path).depth_mm
+        for k, file in enumerate(sorted((tmp_path / "depth").iterdir())):
+            # Of "d", letters tell the order, and there is no number.
+            stem = f"d{chr(ord('a') + k)}" if renamed == "d" else renamed.format(f"{k + 1:06d}")
+            file.rename(file.with_stem(stem))
+        np.testing.assert_array_equal(read(tmp_path).depth_mm, expected)
 
 
 @pytest.mark.parametrize(

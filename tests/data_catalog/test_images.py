@@ -10,9 +10,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from data_catalog.image_pages import pages_in
 from data_catalog.images import (
     UPRIGHT,
+    colour_files,
+    file_key,
     natural_key,
+    order_for_fingerprint,
     orientation,
     read_colour,
     read_depth,
@@ -101,6 +105,35 @@ def test_a_tiff_that_is_not_read_is_not_said_to_be_no_image(tmp_path: Path) -> N
         read_depth(file)
 
 
+@pytest.mark.parametrize("name", ["a.exr", "a.npz"])
+def test_depth_of_another_format_is_said_to_be_that(tmp_path: Path, name: str) -> None:
+    """It was said to be no image, or damaged."""
+    (tmp_path / name).write_bytes(b"\x76\x2f\x31\x01" + bytes(100))
+    expected = r"field depth: depth of this format is not read; expected \.npy, \.tiff, \.tif or \.png with"
+    with pytest.raises(SourceError, match=expected):
+        read_depth(tmp_path / name)
+
+
+def test_webp_is_read(tmp_path: Path) -> None:
+    colours = np.random.default_rng(1).integers(0, 256, (20, 30, 3), dtype=np.uint8)
+    Image.fromarray(colours).save(tmp_path / "a.webp", lossless=True)
+    np.testing.assert_array_equal(read_colour(tmp_path / "a.webp"), colours)
+    assert [file.name for file in colour_files(tmp_path)] == ["a.webp"]
+    Image.fromarray(np.full((20, 30, 3), 90, np.uint8)).save(tmp_path / "b.webp", quality=80)
+    assert np.abs(read_colour(tmp_path / "b.webp").astype(int) - 90).max() < 4
+
+
+@pytest.mark.parametrize("name", ["a.tif", "a.webp", "a.png"])
+def test_several_pictures_in_a_file_are_counted(tmp_path: Path, name: str) -> None:
+    first, second = (Image.new("RGB", (20, 30), (value, 0, 0)) for value in (10, 200))
+    first.save(tmp_path / name, save_all=True, append_images=[second])
+    assert pages_in(tmp_path / name) == 2
+    first.save(tmp_path / name)
+    assert pages_in(tmp_path / name) == 1
+    (tmp_path / name).write_bytes(b"damaged")
+    assert pages_in(tmp_path / name) == 1
+
+
 class TestDepthOfAPalette:
     """Programs that make files smaller store grey of few values so; false colours are stored the same."""
 
@@ -175,6 +208,18 @@ class TestMasks:
         with pytest.raises(SourceError, match="one colour throughout, and opaque in parts"):
             read_mask(written(tmp_path / "a.png", image))
 
+    @pytest.mark.parametrize("extended", [False, True])
+    def test_webp_holds_labels_where_it_is_lossless(self, tmp_path: Path, extended: bool) -> None:
+        described = {"exif": Image.Exif()} if extended else {}
+        image = Image.fromarray(self.LABELS)
+        image.save(tmp_path / "a.webp", lossless=True, exact=True, **described)
+        np.testing.assert_array_equal(read_mask(tmp_path / "a.webp"), self.LABELS > 0)
+        noise = np.random.default_rng(0).integers(0, 9, (20, 30), dtype=np.uint8)
+        Image.fromarray(noise).save(tmp_path / "b.webp", quality=90, **described)
+        assert not read_mask(tmp_path / "b.webp").any()
+        Image.fromarray(self.LABELS * 255).save(tmp_path / "c.webp", quality=90, **described)
+        assert (read_mask(tmp_path / "c.webp") == self.LABELS).mean() > 0.95
+
     def test_black_of_a_jpeg_is_not_all_of_one_value(self, tmp_path: Path) -> None:
         noise = np.random.default_rng(0).integers(0, 6, (20, 30), dtype=np.uint8)
         assert not read_mask(written(tmp_path / "a.jpg", noise)).any()
@@ -183,6 +228,19 @@ class TestMasks:
 def test_natural_order() -> None:
     names = ["f10.png", "f9.png", "f09b.png", "f1.png", "a.png"]
     assert sorted(names, key=natural_key) == ["a.png", "f1.png", "f9.png", "f09b.png", "f10.png"]
+
+
+def test_a_suffix_has_no_place_in_the_order() -> None:
+    """Windows numbers copies so; the first was read last, as a blank comes before a dot."""
+    names = ["frame.png", "frame (0).png", "frame (2).JPG", "frame (10).png", "frame-1.png"]
+    assert sorted(set(names), key=file_key) == names
+    assert sorted(["b.2", "b.10", "b"], key=file_key) == ["b", "b.2", "b.10"]
+    assert sorted(["7.png", "007.png"], key=file_key) == ["007.png", "7.png"]
+
+
+def test_an_order_counts_in_a_cache_key_where_it_was_another() -> None:
+    assert order_for_fingerprint(["f10.png", "f9.png", "f_1.jpg", "f1.png"]) == {}
+    assert order_for_fingerprint(["f (2).png", "f.png"]) == {"order": "without suffixes"}
 
 
 def test_spread_keeps_both_ends() -> None:

@@ -62,6 +62,33 @@ class TestSinus:
         with pytest.raises(PoseError, match=r"motion\.yaml, field poses: 35 poses for 33 frames"):
             read(folder)
 
+    @pytest.mark.parametrize(
+        ("name", "spoilt", "problem"),
+        [
+            (
+                "visible_view_indexes",
+                lambda lines: [lines[0], *lines[:-1]],
+                "00004584.*the view is listed twice",
+            ),
+            (
+                "camera_intrinsics_per_view",
+                lambda lines: [*lines, *lines[::-1]],
+                "8 numbers, which are not fx",
+            ),
+        ],
+    )
+    def test_what_one_pairs_with_another(self, shared_data, tmp_path, name, spoilt, problem) -> None:
+        folder = tmp_path / "sinus"
+        shutil.copytree(shared_data / "sinus_hopkins", folder, copy_function=shutil.copyfile)
+        folder.chmod(0o755)
+        lines = (folder / name).read_text().split()
+        (folder / name).write_text("\n".join(lines * 2))
+        if name == "camera_intrinsics_per_view":
+            assert len(read(folder)) == 35
+        (folder / name).write_text("\n".join(spoilt(lines)))
+        with pytest.raises(SourceError, match=problem):
+            read(folder)
+
 
 class TestSimcol:
     def test_reprojection_of_matched_features(self, shared_data) -> None:

@@ -28,6 +28,7 @@ from tests.data_catalog.footage_fixture import (
     write_cut_out,
     write_flagged,
     write_late,
+    write_streams,
     write_ten_bit,
     write_video,
 )
@@ -65,11 +66,15 @@ class TestIntrinsics:
         (tmp_path / "intrinsics.json").write_text(json.dumps({"field_of_view_deg": 80}))
         sequence = read(file)
         assert sequence.intrinsics == "given"
-        with pytest.raises(ConfigError, match="states its intrinsics itself"):
-            read(file, IngestConfig(calibration=str(calibration_file(tmp_path))))
+        assert sequence.K[0, 0, 0] == pytest.approx(160 / np.tan(np.radians(40)))
 
-    def test_a_calibration_file_takes_the_place_of_the_guess(self, tmp_path, caplog) -> None:
+    @pytest.mark.parametrize("stated", [None, {"field_of_view_deg": 80}, {"fx": 90, "k1": -0.3}])
+    def test_a_calibration_file_takes_the_place_of_the_guess_and_of_what_is_stated(
+        self, tmp_path, caplog, stated
+    ) -> None:
         file = write_video(tmp_path / "a.avi", moving_scene(12, *SIZE, speed=6))
+        if stated is not None:
+            (tmp_path / "intrinsics.json").write_text(json.dumps(stated))
         with caplog.at_level("WARNING"):
             sequence = read(file, IngestConfig(calibration=str(calibration_file(tmp_path))))
         assert sequence.intrinsics == "given"
@@ -424,7 +429,29 @@ class TestShots:
         assert most <= 3
 
 
+class TestStreams:
+    def test_a_cover_is_no_video(self, tmp_path, caplog) -> None:
+        """Nor is it a second camera."""
+        scene = moving_scene(12, *SIZE, speed=6)
+        file = write_streams(tmp_path / "a.mp4", [scene[:1] // 2, scene], cover_first=True)
+        assert len(read(file)) > 6
+        assert "streams of pictures" not in caplog.text
+
+    def test_a_second_camera_is_told_of(self, tmp_path, caplog) -> None:
+        scene = moving_scene(12, *SIZE, speed=6)
+        file = write_streams(tmp_path / "a.mkv", [scene, scene[::-1]])
+        assert len(read(file)) > 6
+        assert "a.mkv: 2 streams of pictures, as of two cameras; the first is read" in caplog.text
+
+
 class TestRefused:
+    @pytest.mark.parametrize("config", [IngestConfig(), IngestConfig(end_s=0.01)])
+    def test_a_single_frame_does_not_stand_still(self, tmp_path, config) -> None:
+        count = 1 if config.end_s is None else 12
+        file = write_video(tmp_path / "one.avi", moving_scene(count, *SIZE, speed=3))
+        with pytest.raises(SourceError, match=r"one\.avi, field frames: one frame alone, in the file or in"):
+            read(file, config)
+
     def test_a_scope_that_stands_still(self, tmp_path) -> None:
         file = write_video(tmp_path / "still.avi", np.repeat(moving_scene(1, *SIZE), 12, axis=0))
         with pytest.raises(SourceError, match=r"still\.avi, field motion: the picture moves by 0\.0%"):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from data_catalog.catalog import read, resolve
+from data_catalog.catalog import read, resolve, source_fingerprint
 from data_catalog.images import colour_files, read_colour
 from data_catalog.inspection import inspect
 from data_catalog.readers import frames_folder
@@ -53,6 +53,23 @@ class TestSeveralFolders:
         write_frames(tmp_path / "images", 4)
         read(tmp_path)
         assert "not read" not in caplog.text
+
+
+class TestNotRecognised:
+    def test_the_folder_that_holds_the_images_is_named(self, tmp_path) -> None:
+        write_frames(tmp_path / "frames", 5)
+        (tmp_path / "notes").mkdir()
+        with pytest.raises(
+            SourceNotFoundError,
+            match=r"in this folder, but images in frames/ \(5\): give the path .* \(\.png, \.jpg, .*\.webp\)",
+        ):
+            resolve(tmp_path)
+
+    def test_images_of_other_formats_are_named(self, tmp_path) -> None:
+        for number in range(3):
+            Image.new("RGB", (48, 42)).save(tmp_path / f"{number}.GIF")
+        with pytest.raises(SourceNotFoundError, match=r"folder: 3 \.gif files, which are not read; expected"):
+            resolve(tmp_path)
 
 
 class TestVideos:
@@ -176,3 +193,24 @@ def test_a_link_to_nothing_is_refused(tmp_path) -> None:
     (tmp_path / "0003.png").symlink_to(tmp_path / "elsewhere.dat")
     assert len(colour_files(tmp_path)) == 6
     assert np.array_equal(read(tmp_path).rgb[2], read(tmp_path).rgb[3])
+
+
+def test_copies_that_windows_numbers_are_read_in_order(tmp_path) -> None:
+    """The first was the last, and a warning asked to list what nobody lists."""
+    write_frames(tmp_path, 9)
+    before = source_fingerprint(tmp_path)
+    assert "order" not in before
+    for file in sorted(tmp_path.iterdir()):
+        number = int(file.stem)
+        file.rename(tmp_path / ("frame.png" if number == 0 else f"frame ({number + 1}).png"))
+    assert read(tmp_path).frame_names == ("frame", *(f"frame ({k})" for k in range(2, 10)))
+    assert not [finding for finding in inspect(tmp_path).findings if finding.topic == "order of frames"]
+    assert source_fingerprint(tmp_path)["order"] == "without suffixes"
+
+
+def test_pages_that_are_not_read_are_told(tmp_path, caplog) -> None:
+    scene = [Image.fromarray(image) for image in moving_scene(6, 48, 42)]
+    for number, image in enumerate(scene):
+        image.save(tmp_path / f"{number}.tif", save_all=True, append_images=scene[:2])
+    assert len(read(tmp_path)) == 6
+    assert caplog.text.count("0.tif: 3 pictures in the file, as pages or an animation") == 1

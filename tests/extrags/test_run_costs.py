@@ -18,6 +18,8 @@ from extrags.run_costs import (
     beyond_the_fit,
     fitted,
     packaged_model,
+    probe_seconds,
+    probed_rasteriser,
     stage_seconds,
     stage_tasks,
 )
@@ -244,6 +246,15 @@ class TestPace:
 
     def test_no_records_no_pace(self) -> None:
         assert self.model.pace([]) == {}
+
+
+@pytest.mark.usefixtures("without_kernels")
+def test_without_kernels_the_probe_is_of_what_renders_instead(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It was refused, though a run was not."""
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    assert probed_rasteriser() == "reference"
+    # A hundred times the native kernels' where it was measured.
+    assert probe_seconds() > 5 * packaged_model().probe_s
 
 
 class TestPackaged:

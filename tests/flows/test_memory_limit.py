@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,8 @@ import pytest
 from extrags.config import profile_config
 from extrags.errors import ConfigError
 from extrags.pipeline import StageName
+from flows.cases import SequenceCase
+from flows.expectation import Expectation, expected_words
 from flows.memory_limit import check_memory
 from flows.runners import DirectRunner
 from flows.wiring import run_sequence
@@ -26,6 +29,21 @@ def test_the_estimate_is_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
         check_memory("a/b", profile_config("balanced"), COUNTS, None, "report", ())
     assert "a/b: 40 frames of 675 x 540 px take at most about" in caplog.text
     assert re.search(r", and about \d+ min of processor time\n$", caplog.text)
+
+
+def test_the_time_is_said_to_be_that_of_the_kernels_where_these_are_missing(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("extrags.raster.available_backends", lambda: ("reference",))
+    with caplog.at_level(logging.INFO, logger="flows.memory_limit"):
+        check_memory("a/b", profile_config("balanced"), COUNTS, None, "report", ())
+    assert "of processor time, with the compiled kernels; these are missing here, and what" in caplog.text
+    found = Expectation(SequenceCase("a/b"), 60.0, measured=False)
+    assert expected_words([found]).endswith(
+        "by their frames, with the compiled kernels; these are missing "
+        "here, and what renders takes many times as long"
+    )
+    assert "kernels" not in expected_words([replace(found, measured=True)])
 
 
 def test_stages_that_do_not_run_take_no_time(caplog: pytest.LogCaptureFixture) -> None:

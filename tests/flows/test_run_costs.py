@@ -12,6 +12,7 @@ from extrags.errors import SourceNotFoundError
 from extrags.run_costs import CostModel, Workload, packaged_model
 from extrags.store import Store
 from flows import run_costs
+from flows.commands.plan import print_prediction
 from flows.run_costs import RunPrediction, predict_run, recorded_costs
 from flows.runners import DirectRunner
 from flows.wiring import run_sequence
@@ -106,6 +107,21 @@ def test_without_history_a_probe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     found = predict_run(Store(tmp_path), work, {"ingest"}, model=model)
     assert (found.source, found.seconds) == ("probe", None)
     assert found.processor_seconds == pytest.approx(3 * 2 * 24)
+
+
+def test_without_kernels_what_renders_is_at_the_pace_of_another_rasteriser(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(run_costs, "probe_seconds", lambda: 1.0)
+    monkeypatch.setattr(run_costs, "probed_rasteriser", lambda: "reference")
+    model = CostModel({"ingest": {"frames": 2.0}, "coarse": {"one": 3.0}}, {}, 0.01)
+    work, _ = work_before_reading(SEQUENCE, CONFIG, {})
+    found = predict_run(Store(tmp_path), work, {"ingest", "coarse"}, model=model)
+    assert [item.processor_seconds for item in found.stages] == pytest.approx([2 * 24, 100 * 3.0])
+    print_prediction(found)
+    assert "kernels are missing: rendering at the speed that a short probe of the reference" in "".join(
+        capsys.readouterr().out
+    )
 
 
 class TestWorkBeforeReading:

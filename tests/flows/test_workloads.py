@@ -36,7 +36,7 @@ def test_frames_that_hold_all_their_detail_are_the_same_work() -> None:
         ({"size": "source"}, "--ingest.size detail"),
         # Larger than the source in places, where no width could be asked for.
         ({"size": "central"}, "--ingest.size detail"),
-        ({"size": "source", "downscale": 2}, "--ingest.width 180"),
+        ({"size": "source", "downscale": 2}, "--ingest.width 180 --ingest.downscale none"),
         ({"size": "thumbnail"}, "--ingest.width 180"),
         ({"size": "source", "width": 225}, "--ingest.width 180"),
         ({"width": 225, "height": 180}, "--ingest.width 180 --ingest.height 144"),
