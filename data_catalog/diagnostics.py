@@ -89,8 +89,16 @@ def _missing(sequence: EndoscopicSequence) -> Iterator[Finding]:
             continue
         usual = sorted(steps)[len(steps) // 2]
         gaps = [k for k, step in enumerate(steps) if step != usual]
-        if min(steps) < 0:
-            # Another series of frames begins.
+        anew = next((k for k, step in enumerate(steps) if step < 0), None)
+        if anew is not None:
+            yield warning(
+                "series of frames",
+                f"after {names[anew]} the numbering begins anew; all frames are taken for one recording by one "
+                "camera, and are parted into training and held-out ones as such. Give each series, as of a left "
+                "and a right camera, a folder of its own",
+                frame=names[anew + 1],
+                field="frame names",
+            )
             continue
         if usual > 0 and 0 < len(gaps) <= max(1, len(steps) // 20):
             gap = gaps[0]

@@ -129,6 +129,8 @@ def test_all_duplicates_are_counted(phantom: EndoscopicSequence) -> None:
 
 def test_the_beginning_of_another_series_is_no_missing_frame(phantom: EndoscopicSequence) -> None:
     names = tuple(f"{side}_{k:03d}" for side in ("left", "right") for k in range(len(phantom) // 2))
-    assert "missing frame" not in topics(replace(phantom, recording=None, frame_names=names))
+    found = topics(replace(phantom, recording=None, frame_names=names))
+    assert "missing frame" not in found
+    assert "Give each series, as of a left and a right camera" in found["series of frames"]
     gap = tuple(f"frame_{k + (k > 7):03d}" for k in range(len(phantom)))
     assert "missing frame" in topics(replace(phantom, recording=None, frame_names=gap))
