@@ -10,6 +10,9 @@ from extrags.config.base import Seed, StageConfig
 
 __all__ = ["CoarseConfig", "DensifyConfig", "LightConfig", "OptimiserConfig", "PoseRefinementConfig"]
 
+LEAST_POINTS = 100
+"""Starting points that a reconstruction has however few its pixels are."""
+
 
 class LightConfig(StageConfig):
     """Near-field light fixed to the camera, and the camera response."""
@@ -171,6 +174,12 @@ class CoarseConfig(StageConfig):
         "ceiling; its figures say nothing about views that were not seen",
     )
     max_points: int = Field(12_000, ge=10, description="starting points at most")
+    pixels_per_point: int = Field(
+        16,
+        ge=1,
+        description="starting points are fewer than `max_points` where there are not so many valid pixels of "
+        "training frames for each: closer points follow single pixels",
+    )
     thickness: float = Field(
         0.1,
         gt=0,
@@ -200,3 +209,11 @@ class CoarseConfig(StageConfig):
     )
     pose_refinement: PoseRefinementConfig = PoseRefinementConfig()
     seed: Seed = Field(0, description="seed of all random sampling")
+
+    def starting_points(self, pixels: int) -> int:
+        """How many points a reconstruction starts from at most.
+
+        Args:
+            pixels: valid ones of all training frames.
+        """
+        return min(self.max_points, max(LEAST_POINTS, pixels // self.pixels_per_point))

@@ -19,7 +19,7 @@ from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
 from extrags.thresholds import HOLE_ALPHA
 from extrags.training.schedule import Schedule
-from extrags.training.starting import starting_gaussians
+from extrags.training.starting import starting_gaussians, valid_pixels
 
 __all__ = [
     "EarlierScene",
@@ -103,10 +103,13 @@ def continued_start(
         return Scene(scene.gaussians, light)
     where = unexplained_pixels(scene, sequence, new)
     # As densely as a start on all frames, whose points are spread over the valid pixels of all of them.
-    share = float(where.sum()) / max(1, int(sequence.mask[chosen].sum()))
+    pixels = valid_pixels(sequence, chosen)
+    share = float(where.sum()) / max(1, pixels)
     limit = config.densify.max_gaussians
     # What the frames before explain is not given up for points of new ones.
-    points = min(math.ceil(share * config.max_points), math.floor(len(new) / len(chosen) * limit))
+    points = min(
+        math.ceil(share * config.starting_points(pixels)), math.floor(len(new) / len(chosen) * limit)
+    )
     kept = math.floor((1 - ROOM_SHARE * len(new) / len(chosen)) * limit)
     scene = Scene(
         scene.gaussians.subset(_strongest(scene, sequence, chosen, min(kept, limit - points))), light

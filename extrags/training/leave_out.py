@@ -20,7 +20,7 @@ from extrags.training.frame_weights import FrameWeights, weighted_views
 from extrags.training.normal_term import NormalTerm
 from extrags.training.optimise import optimise
 from extrags.training.reconstruction import coarse_schedule, scene_extent, smallest_footprint
-from extrags.training.starting import median_depth, starting_gaussians
+from extrags.training.starting import median_depth, starting_gaussians, valid_pixels
 from extrags.training.views import epochs
 
 __all__ = ["MIN_FRAMES", "leave_out_folds", "log_exposures", "partial_scene"]
@@ -101,7 +101,7 @@ def partial_scene(
     start = starting_gaussians(
         sequence,
         kept,
-        brief.max_points,
+        brief.starting_points(valid_pixels(sequence, kept)),
         light=light,
         sh_degree=brief.sh_degree,
         seed=brief.seed,

@@ -23,7 +23,7 @@ from extrags.training.normal_term import NormalTerm
 from extrags.training.optimise import TrainingResult, optimise
 from extrags.training.pose_refinement import PoseRefinement
 from extrags.training.schedule import Schedule
-from extrags.training.starting import median_depth, starting_gaussians
+from extrags.training.starting import median_depth, starting_gaussians, valid_pixels
 from extrags.training.views import epochs
 
 __all__ = ["coarse_schedule", "reconstruct", "refines_poses", "scene_extent", "smallest_footprint"]
@@ -92,7 +92,7 @@ def reconstruct(
         gaussians = starting_gaussians(
             sequence,
             chosen,
-            config.max_points,
+            config.starting_points(valid_pixels(sequence, chosen)),
             light=light,
             sh_degree=config.sh_degree,
             thickness=config.thickness,

@@ -30,6 +30,7 @@ __all__ = [
     "starts_at_random",
     "surface_normals",
     "thin_out",
+    "valid_pixels",
 ]
 
 _log = logging.getLogger(__name__)
@@ -77,6 +78,11 @@ def median_depth(sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]) -> 
         if found:
             return float(np.median(np.concatenate(found)))
     return depth_range(sequence.cameras[frames], sequence.name).typical
+
+
+def valid_pixels(sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]) -> int:
+    """How many pixels of frames are valid, all together."""
+    return sum(int(np.count_nonzero(sequence.mask[frame])) for frame in frames)
 
 
 def starts_at_random(sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]) -> bool:

@@ -164,3 +164,14 @@ def test_a_unit_too_large_for_the_near_plane_is_refused_without_light(
     )
     with pytest.raises(CaptureError, match=r"the typical depth is 0\.0.* or enable coarse\.light"):
         reconstruct(small, CoarseConfig(iterations=5, light=LightConfig(enabled=False)))
+
+
+@pytest.mark.parametrize(("per_point", "most"), [(1, 600), (16, 600), (64, None)])
+def test_starting_points_are_no_more_than_the_pixels_allow(
+    tube_sequence: EndoscopicSequence, per_point: int, most: int | None
+) -> None:
+    config = CoarseConfig(iterations=1, max_points=600, pixels_per_point=per_point, densify=QUIET)
+    pixels = int(tube_sequence.mask[tube_sequence.train].sum())
+    most = pixels // 64 if most is None else most
+    count = len(reconstruct(tube_sequence, config).scene.gaussians)
+    assert 0.7 * most < count <= most
