@@ -55,6 +55,7 @@ THREE_DGS_SHARED = frozenset(
     {
         "iterations",
         "max_points",
+        "pixels_per_point",
         "seed",
         "depth_weight_final_share",  # of a term whose weight is zero
         "densify.max_gaussians",

@@ -43,7 +43,7 @@ PROFILES: dict[str, PipelineConfig] = {
     "balanced": PipelineConfig(
         ingest=IngestConfig(size="source"),
         coarse=CoarseConfig(
-            iterations=5000, max_points=16_000, sh_every=1000, densify=DensifyConfig(max_gaussians=40_000)
+            iterations=5000, max_points=50_000, sh_every=1000, densify=DensifyConfig(max_gaussians=75_000)
         ),
         enhance=EnhanceConfig(
             folds=3,
@@ -52,7 +52,7 @@ PROFILES: dict[str, PipelineConfig] = {
             max_views=240,
         ),
         explore=ExploreConfig(rotation_deg=20.0, orbit_deg=20.0),
-        finetune=FinetuneConfig(iterations=4000),
+        finetune=FinetuneConfig(iterations=4000, growth=1.5),
         evaluate=EvaluateConfig(lpips_nets=("alex", "vgg")),
     ),
     # The paper's counts, at the full resolution of the source's frames.

@@ -130,7 +130,7 @@ def recorded_run(
     run = SequenceRun(name, config, "memory://made-up", recorded, leave_out=leave_out)
     run.store = recorded  # type: ignore[assignment]
     # Nothing is kept of it.
-    with patch("flows.cached_stages.recorded_run", lambda store, name: nullcontext()):
+    with patch("flows.cached_stages.recorded_run", lambda *_: nullcontext()):
         outcome = run.run()
     if outcome.error is not None:
         raise outcome.error

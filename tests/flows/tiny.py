@@ -33,6 +33,7 @@ TINY: dict[str, Any] = {
     "ingest.max_frames": 24,
     "coarse.iterations": 120,
     "coarse.max_points": 1500,
+    "coarse.pixels_per_point": 1,
     "coarse.sh_degree": 0,
     "uc_nerf.iterations": 12,
     "uc_nerf.stereo_width": 16,
