@@ -1,7 +1,7 @@
 """Which settings change which cache keys: each changes its stage and what follows, and nothing before.
 
-All settings are found by introspection. `DIRECTLY` (`cache_key_tables`) says which stages read them; a setting
-without an entry fails, as does one that changes more or less than it should.
+All settings are found by introspection. `DIRECTLY` (`cache_key_tables`) says which stages read them; a
+setting without an entry fails, as does one that changes more or less than it should.
 """
 
 from __future__ import annotations
