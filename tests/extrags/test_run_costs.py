@@ -110,10 +110,10 @@ class TestGaussians:
     """How many there will be, for who plans a run before there is a scene."""
 
     def test_the_limit_holds_in_short_profiles_and_not_with_the_counts_of_paper(self) -> None:
-        for profile in ("quick", "balanced", "paper"):
+        for profile, pixels in (("quick", 160 * 128), ("balanced", 675 * 540), ("paper", 160 * 128)):
             config = profile_config(profile)
             limit = config.coarse.densify.max_gaussians
-            found = Workload(20480, 48, 20, 28, config).numbers()
+            found = Workload(pixels, 48, 20, 28, config).numbers()
             if profile == "paper":
                 # 97,000 to 105,000 in four scenes.
                 assert 95_000 < found["gaussians"] < 110_000
@@ -121,6 +121,12 @@ class TestGaussians:
             else:
                 assert found["gaussians"] == limit
                 assert found["final_gaussians"] == config.finetune.growth * limit
+
+    def test_small_images_start_from_fewer_points(self) -> None:
+        config = profile_config("balanced")
+        small, large = (Workload(pixels, 48, 20, 28, config).numbers() for pixels in (160 * 128, 675 * 540))
+        assert small["gaussians"] == pytest.approx(51_000)
+        assert large["gaussians"] == 75_000
 
     def test_without_densification_there_are_those_of_the_start(self) -> None:
         config = profile_config("quick").with_overrides(
