@@ -32,12 +32,12 @@ from data_catalog.images import (
 from data_catalog.lens_use import LensUse
 from data_catalog.sampling import CameraModel, LensSampling, Sampling
 from data_catalog.splits import every_nth
+from data_catalog.unknown_depth import UnknownDepth
 from extrags.cameras import Cameras, rotation_about
 from extrags.config import IngestConfig
 from extrags.errors import SourceError
 from extrags.events import Progress, emit
 from extrags.frame_stacks import FrameStack, stacked
-from extrags.known_depth import FARTHEST, is_background
 from extrags.lens import Lens
 from extrags.observed_surface import observed_by_depth
 from extrags.radial_lens import RadialLens
@@ -270,8 +270,7 @@ class _Pixels:
         self.colours = FrameStack(count)
         self.depths = FrameStack(count)
         self.brightest = 0
-        self.unfinite: dict[Path, int] = {}
-        self.background: dict[Path, int] = {}
+        self._unknown_depth = UnknownDepth()
         self._depth_steps = DepthSteps()
         # A field of view that was asked for is meant to leave out what is beyond it.
         self._use = LensUse(count) if config.field_of_view_deg is None else None
@@ -296,7 +295,9 @@ class _Pixels:
         else:
             self._masks.append(self._mask(frame, sampling))
         if frame.depth_file is not None:
-            depth = self._known(source.read_depth(frame.depth_file, frame.label), frame.depth_file)
+            depth = self._unknown_depth.zeroed(
+                source.read_depth(frame.depth_file, frame.label), frame.depth_file
+            )
             # Before shrinking, so that row, column and count are those of the file.
             check_depth(depth, frame=frame.label, file=frame.depth_file)
             _check_size(depth, frame, frame.depth_file, "depth", None)
@@ -322,33 +323,9 @@ class _Pixels:
                 frame=frames[0].label,
                 field="rgb",
             )
-        for counted, what in (
-            (self.unfinite, "are NaN or infinite"),
-            (self.background, f"are over {FARTHEST:g} times as far away as what is near in their image"),
-        ):
-            if counted:
-                logger.warning(
-                    "%s: %d depth values in %d of %d frames, this one first, %s, and taken as unknown",
-                    next(iter(counted)),
-                    sum(counted.values()),
-                    len(counted),
-                    len(frames),
-                    what,
-                )
+        self._unknown_depth.tell(len(frames))
         if self._use is not None:
             self._use.tell()
-
-    def _known(self, depth: Float[np.ndarray, "h w"], file: Path) -> Float[np.ndarray, "h w"]:
-        """Depth with 0 where it is not finite, or a background, which is counted."""
-        finite = np.isfinite(depth)
-        if not finite.all():
-            self.unfinite[file] = int((~finite).sum())
-            depth = np.where(finite, depth, np.float32(0))
-        background = is_background(depth)
-        if background.any():
-            self.background[file] = int(background.sum())
-            depth = np.where(background, np.float32(0), depth)
-        return depth
 
     def lens(self, frames: Sequence[PosedFrame], file: Path) -> RadialLens | None:
         """The lens of all frames that were read; None for pinholes.
