@@ -307,10 +307,12 @@ def hole_gaussians(
     shown_px_mm = np.median(pseudo_views.depth_mm.reshape(-1)[chosen] / cameras.K[view, 0, 0])
     spacing = max(_typical_spacing(scene.gaussians), LEAST_SPACING_PX * float(shown_px_mm))
     points, rgb = _one_per_cell(points, rgb, spacing)
+    wanted = len(points)
     points, rgb = thin_out(points, rgb, room)
-    radius = np.full(len(points), 0.7 * spacing)
     if len(points) < MIN_POINTS:
         return None
+    # On a surface, fewer points lie farther apart: they have to close it as well.
+    radius = np.full(len(points), 0.7 * spacing * np.sqrt(wanted / len(points)))
     return Gaussians.from_points(
         points,
         rgb.clip(LEAST_COLOR, None),

@@ -32,7 +32,8 @@ class TestEstimate:
         assert named <= set(all_stage_versions())
 
     def test_larger_frames_take_longer_where_pixels_count(self) -> None:
-        config = profile_config("balanced")
+        # The number of Gaussians shall be the same.
+        config = profile_config("balanced").with_overrides({"coarse.pixels_per_point": 1})
         small, large = (
             expected_seconds(config, replace(usual_work(config), pixels=pixels, width=width))
             for pixels, width in ((160 * 128, 160), (640 * 512, 640))

@@ -338,3 +338,18 @@ class TestHoleGaussians:
         footprint_mm = depth_mm / pseudo.cameras.K[0, 0, 0]
         radius = new.scales.exp().max(dim=1).values
         torch.testing.assert_close(radius, torch.full_like(radius, 1.4 * footprint_mm), rtol=1e-4, atol=0)
+
+    @pytest.mark.usefixtures("real_views_carve_alone")
+    def test_fewer_gaussians_for_want_of_room_close_the_surface_as_well(
+        self, sequence: EndoscopicSequence, pseudo: PseudoViews
+    ) -> None:
+        blind = replace(sequence, mask=np.zeros_like(sequence.mask))
+        everywhere = np.ones((3, HEIGHT, WIDTH), dtype=bool)
+        views = wall_views(pseudo, np.full((3, HEIGHT, WIDTH), 20.0), everywhere)
+        areas = []
+        for room in (10_000, 100):
+            new = hole_gaussians(wall_scene(None), blind, views, room)
+            assert new is not None
+            assert len(new) <= room
+            areas.append(len(new) * float(new.scales.exp().max(dim=1).values.median()) ** 2)
+        assert areas[1] == pytest.approx(areas[0], rel=0.01)
