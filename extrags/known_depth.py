@@ -18,11 +18,15 @@ def is_background(depth: Real[np.ndarray, "*n"]) -> Bool[np.ndarray, "*n"]:
     """Values too far away to be surface; 0, which is unknown, is none of them.
 
     Args:
-        depth: finite, of any unit.
+        depth: finite z-depth of any shape and unit, 0 where unknown.
+
+    Returns:
+        True where it is one, of the same shape.
     """
     positive = depth > 0
     if not positive.any():
         return positive
     known = depth[positive]
-    near = np.partition(known, rank := int(_NEAR_QUANTILE * (known.size - 1)))[rank]
+    rank = int(_NEAR_QUANTILE * (known.size - 1))
+    near = np.partition(known, rank)[rank]
     return np.asarray(depth > FARTHEST * np.float64(near))

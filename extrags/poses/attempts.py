@@ -59,7 +59,7 @@ def attempted(
     config: PosesConfig,
     run: Callable[[PoseJob, str], PoseJobResult],
     *,
-    retry: bool,
+    retry_too_few: bool,
 ) -> Attempt:
     """COLMAP's first attempt, or its second where that registers clearly more training frames.
 
@@ -68,8 +68,8 @@ def attempted(
         job: the first attempt.
         config: settings; `lenient_retry` allows the second.
         run: the job of a sequence of a name.
-        retry: false where another way is left if too few frames register. Where enough do, and some are
-            missing, there is no other.
+        retry_too_few: whether COLMAP tries again where too few frames registered to go on: false where
+            frames can be aligned by depth instead.
 
     Raises:
         CaptureError: from `run`; from that of the second attempt only where the first was not enough.
@@ -77,7 +77,7 @@ def attempted(
     first = _attempt(sequence, job, run)
     found, total = first.report["registered_train"], first.report["n_train"]
     enough = enough_registered(first.report, config)
-    wanted = total - found > CLEAR_SHARE * total if enough else retry
+    wanted = total - found > CLEAR_SHARE * total if enough else retry_too_few
     if not (config.lenient_retry and wanted):
         return first
     _LOG.warning(

@@ -186,7 +186,7 @@ def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig | None = No
     seen = square.at_most_width(config.max_width)
     job = _job(seen, config, unknown_lens=unknown_lens)
     no_depth = sequence.depth_mm is None or config.fallback == "never"
-    attempt = attempted(seen, job, config, _run, retry=no_depth)
+    attempt = attempted(seen, job, config, _run, retry_too_few=no_depth)
     result, registered, report = attempt.result, attempt.registered, attempt.report
     # Told in the pixels of the frames.
     report["mean_reprojection_px"] *= square.width / seen.width

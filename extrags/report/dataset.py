@@ -17,6 +17,7 @@ from extrags.report.run_facts import given_settings, seconds_of_all, shared_fact
 from extrags.report.wording import (
     compare,
     count,
+    coverage_of,
     described_metrics,
     duration,
     metric_of,
@@ -162,15 +163,11 @@ def _table_row(row: DatasetRow, metrics: Sequence[Metric]) -> dict[str, Any]:
                 metric,
                 metric_of(row.coarse, metric.key),
                 metric_of(row.final, metric.key),
-                coverage=(_coverage(row.coarse, metric), _coverage(row.final, metric)),
+                coverage=(coverage_of(metric, row.coarse), coverage_of(metric, row.final)),
             )
             for metric in metrics
         ],
     }
-
-
-def _coverage(tree: Mapping[str, Any] | None, metric: Metric) -> float | None:
-    return metric_of(tree, metric.coverage) if metric.coverage else None
 
 
 def _both(row: DatasetRow, metric: Metric, path: tuple[str, ...]) -> tuple[float, float] | None:

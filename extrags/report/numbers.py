@@ -14,6 +14,7 @@ from extrags.report.inputs import ReportInputs
 from extrags.report.wording import (
     Comparison,
     compare,
+    coverage_of,
     described_metrics,
     metric_of,
     number,
@@ -193,9 +194,7 @@ def _coverage(
     path: tuple[str, ...] = (),
 ) -> tuple[float | None, float | None]:
     """Share of the pixels that a metric is over in both scenes; None for all of them."""
-    if not metric.coverage:
-        return None, None
-    return metric_of(coarse, *path, metric.coverage), metric_of(final, *path, metric.coverage)
+    return coverage_of(metric, coarse, *path), coverage_of(metric, final, *path)
 
 
 def missing_reasons(inputs: ReportInputs) -> list[tuple[str, str]]:

@@ -20,6 +20,7 @@ from extrags.report.viewer.content import script_text
 from extrags.report.wording import (
     compare,
     count,
+    coverage_of,
     described_metrics,
     duration,
     metric_of,
@@ -161,10 +162,7 @@ def _figures(runs: Sequence[ComparedRun], metrics: Sequence[Metric]) -> list[dic
     for path, label in REGIONS:
         for metric in with_coverages(metrics):
             values = [metric_of(run.result["metrics"], *path, metric.key) for run in runs]
-            shares = [
-                metric_of(run.result["metrics"], *path, metric.coverage) if metric.coverage else None
-                for run in runs
-            ]
+            shares = [coverage_of(metric, run.result["metrics"], *path) for run in runs]
             if all(value is None for value in values):
                 continue
             known = [

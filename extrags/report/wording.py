@@ -14,6 +14,7 @@ __all__ = [
     "Comparison",
     "compare",
     "count",
+    "coverage_of",
     "coverage_words",
     "described_metrics",
     "duration",
@@ -138,6 +139,11 @@ def metric_of(tree: Mapping[str, Any] | None, *path: str) -> float | None:
             return None
         node = node.get(name)
     return None if node is None or isinstance(node, Mapping) else float(node)
+
+
+def coverage_of(metric: Metric, tree: Mapping[str, Any] | None, *path: str) -> float | None:
+    """Share of the pixels, in [0, 1], that a metric is over; None where it is over all, or nobody knows."""
+    return metric_of(tree, *path, metric.coverage) if metric.coverage else None
 
 
 def same_pixels(*coverages: float | None) -> bool:

@@ -112,7 +112,8 @@ def starting_gaussians(
     """Gaussians from back-projected depth, from sparse points without depth, or at random without either.
 
     Unsure pixels of estimated depth beside sure ones start none: where depth jumps, an estimate lies between
-    both surfaces, and Gaussians there would hang in front of what was never seen.
+    both surfaces, and Gaussians there would hang in front of what was never seen. Nor do backgrounds
+    (`extrags.known_depth`), which a warning counts.
 
     Each point carries the mean albedo of its pixels: the colour with light and response divided out.
     Radii follow the distance to the three nearest neighbours. Random points lie in the cameras' frusta; they

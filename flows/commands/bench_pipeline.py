@@ -11,7 +11,7 @@ from typing import Any
 from extrags.errors import ConfigError
 from flows.commands.benchmark import parsed_seeds
 from flows.commands.common import items, set_up_logging, write_json
-from flows.commands.options import Parser, add_json, add_output, add_sequences, add_settings
+from flows.commands.options import Parser, add_json, add_methods, add_output, add_sequences, add_settings
 
 __all__ = ["EXAMPLES", "add_arguments", "pipeline"]
 
@@ -32,7 +32,6 @@ def add_arguments(parser: Parser) -> None:
     """The options of `extrags bench pipeline`."""
     from extrags.config import PROFILES
     from flows.budgets import PRESETS, SET_PRESETS
-    from flows.methods import METHODS
 
     parser.description = (
         "Run every method with every budget, measure what it costs and how good it is, and find the runs "
@@ -41,13 +40,7 @@ def add_arguments(parser: Parser) -> None:
         "what reads files that were changed. Exit code 1 when a run failed."
     )
     add_sequences(parser, chosen=True)
-    parser.add_argument(
-        "--methods",
-        nargs="+",
-        default=["coarse", "extrags"],
-        metavar="METHOD",
-        help=f"of {', '.join(METHODS)} (default: coarse extrags)",
-    )
+    add_methods(parser)
     parser.add_argument(
         "--profiles",
         nargs="+",

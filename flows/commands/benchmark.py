@@ -17,7 +17,15 @@ from flows.commands.common import (
     store_root,
     write_json,
 )
-from flows.commands.options import Parser, add_json, add_runner, add_sequences, add_settings, add_store
+from flows.commands.options import (
+    Parser,
+    add_json,
+    add_methods,
+    add_runner,
+    add_sequences,
+    add_settings,
+    add_store,
+)
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -29,21 +37,13 @@ __all__ = ["add_arguments", "benchmark", "parsed_seeds", "parsed_variants", "pri
 
 def add_arguments(parser: Parser) -> None:
     """The options of `extrags benchmark`."""
-    from flows.methods import METHODS
-
     parser.description = (
         "Run every method on every sequence with every seed, and compare them pair by pair. What is in the "
         "store already is taken from there with the time it took when it was made."
     )
     parser.set_defaults(command=benchmark)
     add_sequences(parser, chosen=True)
-    parser.add_argument(
-        "--methods",
-        nargs="+",
-        default=["coarse", "extrags"],
-        metavar="METHOD",
-        help=f"of {', '.join(METHODS)} (default: coarse extrags)",
-    )
+    add_methods(parser)
     parser.add_argument(
         "--variant",
         dest="variants",

@@ -24,6 +24,7 @@ __all__ = [
     "Parser",
     "add_json",
     "add_method",
+    "add_methods",
     "add_output",
     "add_profile",
     "add_runner",
@@ -122,6 +123,19 @@ def add_sequences(parser: Parser, *, chosen: bool, nargs: str = "+") -> None:
         help="names, paths, patterns over the catalogue's names ('c3vdv2/*@sparse'), or @FILE for a manifest"
         if chosen
         else "names in the catalogue (`extrags data list`), or paths of folders, videos or DICOM files",
+    )
+
+
+def add_methods(parser: Parser) -> None:
+    """Several methods, `coarse` and `extrags` by default."""
+    from flows.methods import METHODS
+
+    parser.add_argument(
+        "--methods",
+        nargs="+",
+        default=["coarse", "extrags"],
+        metavar="METHOD",
+        help=f"of {', '.join(METHODS)} (default: coarse extrags)",
     )
 
 

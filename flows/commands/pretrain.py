@@ -66,7 +66,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument(
         "--real-textures",
         action="store_true",
-        help="a third of the cavities wear tissue of real laparoscopy frames, which must be installed",
+        help="a third of the cavities wear tissue of real laparoscopy frames, which must be on this machine",
     )
     parser.add_argument(
         "--explored",
@@ -117,7 +117,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument(
         "--without-perceptual",
         action="store_true",
-        help="train without the perceptual distance, whose weights (LPIPS, SqueezeNet) must be installed",
+        help="train without the perceptual distance, which needs weights (LPIPS, SqueezeNet)",
     )
     parser.add_argument(
         "--deterministic", action="store_true", help="a plain regression: the baseline of the diffusion"

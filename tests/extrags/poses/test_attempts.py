@@ -72,10 +72,10 @@ class Colmap:
         )
 
 
-def outcome(colmap: Colmap, *, retry: bool = True, **settings: Any) -> Attempt:
+def outcome(colmap: Colmap, *, retry_too_few: bool = True, **settings: Any) -> Attempt:
     given = sequence(colmap.n_train)
     config = PosesConfig(**settings)
-    return attempted(given, estimate._job(given, config), config, colmap, retry=retry)
+    return attempted(given, estimate._job(given, config), config, colmap, retry_too_few=retry_too_few)
 
 
 @pytest.mark.parametrize(
@@ -134,7 +134,7 @@ def test_a_first_attempt_that_was_enough_outlives_the_failure_of_the_second(
     given, config = sequence(20), PosesConfig()
     job = estimate._job(given, config)
     enough = partial(run, colmap=Colmap(20, (17, 20)))
-    found = attempted(given, job, config, enough, retry=True)
+    found = attempted(given, job, config, enough, retry_too_few=True)
     assert int(found.registered.sum()) == 17
     assert "lenient" not in found.report
     assert (
@@ -142,24 +142,24 @@ def test_a_first_attempt_that_was_enough_outlives_the_failure_of_the_second(
     )
     too_few = partial(run, colmap=Colmap(20, (6, 20)))
     with pytest.raises(CaptureError, match="code -9"):
-        attempted(given, job, config, too_few, retry=True)
+        attempted(given, job, config, too_few, retry_too_few=True)
 
 
 @pytest.mark.parametrize(
-    ("first", "retry", "settings"),
+    ("first", "retry_too_few", "settings"),
     [(7, False, {}), (10, True, {"lenient_retry": False}), (7, True, {"lenient_retry": False})],
 )
 def test_another_way_or_the_settings_leave_it_at_one(
-    first: int, retry: bool, settings: dict[str, Any]
+    first: int, retry_too_few: bool, settings: dict[str, Any]
 ) -> None:
     colmap = Colmap(17, (first, 17))
-    outcome(colmap, retry=retry, **settings)
+    outcome(colmap, retry_too_few=retry_too_few, **settings)
     assert colmap.lenient == [False]
 
 
 def test_where_enough_registered_there_is_no_other_way_for_the_rest() -> None:
     colmap = Colmap(17, (10, 17))
-    assert int(outcome(colmap, retry=False).registered.sum()) == 17
+    assert int(outcome(colmap, retry_too_few=False).registered.sum()) == 17
     assert colmap.lenient == [False, True]
 
 
