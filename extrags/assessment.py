@@ -19,6 +19,7 @@ from extrags.exploration.waves import start_views
 from extrags.scene import Scene
 from extrags.scene_plan import ScenePlan, decide
 from extrags.sequence import EndoscopicSequence
+from extrags.threads import one_torch_thread
 
 __all__ = ["assess", "measure", "probe_views"]
 
@@ -53,6 +54,7 @@ def assess(scene: Scene, sequence: EndoscopicSequence, config: PipelineConfig | 
     return decide(measure(scene, sequence, config.assess, config.explore.coverage), config)
 
 
+@one_torch_thread()
 def measure(
     scene: Scene, sequence: EndoscopicSequence, settings: AssessConfig, coverage: CoverageConfig
 ) -> dict[str, float]:

@@ -17,10 +17,12 @@ from extrags.metrics.surface import TrueSurface, evaluate_surface, scene_surface
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
 from extrags.surface import Mesh
+from extrags.threads import one_torch_thread
 
 __all__ = ["evaluate", "evaluate_renders", "render"]
 
 
+@one_torch_thread()
 def render(
     scene: Scene,
     sequence: EndoscopicSequence,
@@ -102,6 +104,7 @@ def evaluate_renders(
     )
 
 
+@one_torch_thread()
 def evaluate(
     scene: Scene,
     sequence: EndoscopicSequence,

@@ -17,6 +17,7 @@ from extrags.gaussians import Gaussians
 from extrags.illumination import NearFieldLight
 from extrags.raster import CameraLight, Rendering, rasterize
 from extrags.store.storable import Storable
+from extrags.threads import one_torch_thread
 from extrags.zarr_io import group_exists
 
 __all__ = ["NEAR", "SHALLOWEST", "Scene"]
@@ -60,6 +61,7 @@ class Scene(Storable):
             return self
         return Scene(self.gaussians.to(device), None if self.light is None else self.light.to(device))
 
+    @one_torch_thread()
     def render(
         self,
         cameras: Cameras,
@@ -91,6 +93,7 @@ class Scene(Storable):
             **options,
         )
 
+    @one_torch_thread()
     def render_attributes(
         self, cameras: Cameras, attributes: Float[Tensor, "n k"]
     ) -> tuple[Float[Tensor, "c h w k"], Float[Tensor, "c h w"]]:

@@ -22,6 +22,7 @@ from extrags.frame_stacks import FrameStack
 from extrags.radial_lens import WIDE_FIELD_DEG
 from extrags.scene import Scene
 from extrags.store.storable import Storable
+from extrags.threads import one_torch_thread
 from extrags.zarr_io import new_group, open_group, read_array, write_array
 
 __all__ = ["Mesh", "fuse_depth", "fuse_surface", "rendered_depth"]
@@ -83,6 +84,7 @@ class Mesh(Storable):
         PlyData(elements, byte_order="<").write(str(path))
 
 
+@one_torch_thread()
 def fuse_surface(scene: Scene, cameras: Cameras, config: SurfaceConfig | None = None) -> Mesh:
     """Mesh of the surface visible in the views, by TSDF fusion of the scene's median depth.
 

@@ -25,6 +25,7 @@ from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
 from extrags.store.storable import Storable
 from extrags.surface import fuse_surface
+from extrags.threads import one_torch_thread
 from extrags.zarr_io import new_group, open_group, read_array, write_array
 
 __all__ = ["Exploration", "explore", "finish", "grow", "start_exploration"]
@@ -258,6 +259,7 @@ def finish(context: SearchContext, state: WaveState, train_frames: Int[np.ndarra
     )
 
 
+@one_torch_thread()
 def explore(
     scene: Scene,
     sequence: EndoscopicSequence,

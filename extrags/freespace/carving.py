@@ -17,6 +17,7 @@ from extrags.freespace.visibility import ViewDepths, seen_through
 from extrags.freespace.walls import voxels_of_triangles
 from extrags.scene import Scene
 from extrags.surface import Mesh
+from extrags.threads import one_torch_thread
 
 __all__ = ["carve", "carving_views"]
 
@@ -30,6 +31,7 @@ WALL_DEPTH = 4.0
 """Distances inside occupied space are told apart up to this, in voxels."""
 
 
+@one_torch_thread()
 def carve(
     scene: Scene,
     mesh: Mesh,

@@ -28,6 +28,7 @@ from extrags.poses.scale import DENSE_SHARE, depth_scale, typical_depth
 from extrags.scarce_depth import without_scarce_depth
 from extrags.sequence import EndoscopicSequence, ScaleSource, Split
 from extrags.sparse_depth import MIN_POINTS_PER_VIEW, interpolated_depth, pixel_lattice
+from extrags.threads import one_torch_thread
 
 __all__ = ["MIN_TRAINING_FRAMES", "PoseEstimate", "estimate_poses", "with_estimated_poses"]
 
@@ -115,6 +116,7 @@ class PoseEstimate:
         }
 
 
+@one_torch_thread()
 def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig | None = None) -> PoseEstimate:
     """Find the cameras of a sequence: by COLMAP, and where that fails, by colour and depth.
 

@@ -23,7 +23,7 @@ from extrags.config import EnhanceConfig
 from extrags.errors import ShapeError
 from extrags.events import Progress, emit
 from extrags.restoration.clips import render_clips
-from extrags.restoration.protocol import Clip, Enhancer
+from extrags.restoration.protocol import Clip, Enhancer, restore_clip
 from extrags.scene import Scene
 from extrags.store.storable import Storable
 from extrags.threads import in_threads
@@ -213,7 +213,7 @@ def make_keyframes(
 
 
 def _restored(clip: Clip, enhancer: Enhancer, view: tuple[int, int]) -> Keyframes:
-    restoration = enhancer.restore(clip)
+    restoration = restore_clip(enhancer, clip)
     depth = restoration.depth_mm
     if depth is None:
         with torch.no_grad():

@@ -12,13 +12,16 @@ from jaxtyping import Float, Int
 
 from extrags.cameras import Cameras
 from extrags.config import CoarseConfig, EnhanceConfig
-from extrags.errors import ShapeError
+from extrags.errors import NonFiniteError, ShapeError
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
 from extrags.view_synthesis.conditioning import Layers
 from extrags.view_synthesis.references import LightTransfer
 
-__all__ = ["Backend", "Clip", "Enhancer", "Restoration", "restore_clips"]
+__all__ = ["Backend", "Clip", "Enhancer", "Restoration", "restore_clip", "restore_clips"]
+
+COLOR_ROUNDING = 1e-4
+"""By so much colours may lie outside [0, 1]: half precision, and interpolation, round."""
 
 
 @dataclass(frozen=True)
@@ -167,6 +170,47 @@ class Backend(Protocol):
         ...
 
 
+def restore_clip(enhancer: Enhancer, clip: Clip) -> Restoration:
+    """Restore a clip, and hold the restorer to what `Restoration` promises.
+
+    What comes back may be of another program: stored in steps of 1/255, a NaN would be black.
+
+    Raises:
+        ShapeError: when there is no restoration, or an array of it has another shape, is not of floats or is
+            out of range.
+        NonFiniteError: when an array of it holds NaN or infinity.
+    """
+    restoration = enhancer.restore(clip)
+    name = f"the restorer {enhancer.name!r}, clip {clip.index}"
+    if not isinstance(restoration, Restoration):
+        raise ShapeError(f"{name}: expected a Restoration, found {type(restoration).__name__}")
+    planes = (len(clip), clip.cameras.height, clip.cameras.width)
+    _check_array(f"{name}: rgb", restoration.rgb, (*planes, 3), (-COLOR_ROUNDING, 1 + COLOR_ROUNDING))
+    if restoration.expected_error is not None:
+        _check_array(f"{name}: expected_error", restoration.expected_error, planes, (0.0, np.inf))
+    if restoration.depth_mm is not None:
+        _check_array(f"{name}: depth_mm", restoration.depth_mm, planes, (0.0, np.inf))
+    return restoration
+
+
 def restore_clips(enhancer: Enhancer, clips: Iterable[Clip]) -> list[Restoration]:
-    """Restore clips one after the other; each is independent of the others."""
-    return [enhancer.restore(clip) for clip in clips]
+    """Restore clips one after the other; each is independent of the others.
+
+    Raises:
+        ExtragsError: as `restore_clip`.
+    """
+    return [restore_clip(enhancer, clip) for clip in clips]
+
+
+def _check_array(name: str, values: object, shape: tuple[int, ...], limits: tuple[float, float]) -> None:
+    if not isinstance(values, np.ndarray) or not np.issubdtype(values.dtype, np.floating):
+        found = values.dtype if isinstance(values, np.ndarray) else type(values).__name__
+        raise ShapeError(f"{name} has to be a NumPy array of floats, found {found}")
+    if values.shape != shape:
+        raise ShapeError(f"{name} has to have the shape {shape}, found {values.shape}")
+    if not np.isfinite(values).all():
+        raise NonFiniteError(f"{name} holds NaN or infinity")
+    least, most = float(values.min()), float(values.max())
+    if least < limits[0] or most > limits[1]:
+        wanted = "non-negative" if np.isinf(limits[1]) else "in [0, 1]"
+        raise ShapeError(f"{name} has to be {wanted}, found {least:.4g} to {most:.4g}")

@@ -36,7 +36,7 @@ from extrags.restoration.agreement import agreed_views, feathered_invented_share
 from extrags.restoration.benchmark.evaluation import iterate_held_out_clips
 from extrags.restoration.classical import ClassicalEnhancer
 from extrags.restoration.diffusion.precision import chosen_precision
-from extrags.restoration.protocol import Clip, Enhancer
+from extrags.restoration.protocol import Clip, Enhancer, restore_clip
 from extrags.restoration.refinement.refiner import textured_views
 from extrags.restoration.refinement.weights import bundled_refiner
 from extrags.restoration.surface_texture import SurfaceTexture
@@ -371,7 +371,7 @@ class _RestoredClip:
         """Restore a clip of the coarse scene's views, of which `final` are those of the final scene."""
         rendered = torch.from_numpy(final.rgb).permute(0, 3, 1, 2).clamp(0, 1)
         solid = torch.from_numpy(final.alpha)[:, None].clamp(0, 1)
-        restoration = enhancer.restore(clip)
+        restoration = restore_clip(enhancer, clip)
         colors = torch.from_numpy(restoration.rgb).permute(0, 3, 1, 2)
         to_invent = unconfirmed(clip.layers)
         depth = (

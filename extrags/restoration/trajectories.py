@@ -23,6 +23,7 @@ from extrags.view_synthesis.references import ReferenceViews
 __all__ = ["at_working_size", "restore", "restore_batch", "restore_keyframes", "restored_batches"]
 
 
+@one_torch_thread()
 def restore(
     scene: Scene,
     sequence: EndoscopicSequence,

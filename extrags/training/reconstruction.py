@@ -16,6 +16,7 @@ from extrags.errors import CaptureError, ConfigError
 from extrags.illumination import NearFieldLight
 from extrags.scene import NEAR, SHALLOWEST, Scene
 from extrags.sequence import EndoscopicSequence
+from extrags.threads import one_torch_thread
 from extrags.training.continuing import EarlierScene, continued_schedule, continued_start
 from extrags.training.footprint import SmallestFootprint
 from extrags.training.frame_weights import weighted_views
@@ -31,6 +32,7 @@ __all__ = ["coarse_schedule", "reconstruct", "refines_poses", "scene_extent", "s
 logger = logging.getLogger(__name__)
 
 
+@one_torch_thread()
 def reconstruct(
     sequence: EndoscopicSequence,
     config: CoarseConfig | None = None,

@@ -10,6 +10,7 @@ from torch import Tensor
 from extrags.errors import CaptureError, ShapeError
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence, saturated_mask
+from extrags.threads import one_torch_thread
 from extrags.view_synthesis.references import SEEN_WEIGHT, LightTransfer, ReferenceViews, visibility_of
 from extrags.view_synthesis.shrinkage import colour_support, shrunk_sh0
 from extrags.view_synthesis.warp import with_fitted_transfer
@@ -22,6 +23,7 @@ SOLID_ALPHA = 0.9
 """Rendered depth is taken for the real view's where the rendering is at least this opaque."""
 
 
+@one_torch_thread()
 def gather_references(
     scene: Scene,
     sequence: EndoscopicSequence,

@@ -1,15 +1,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+import pytest
 import torch
 
 from extrags.cameras import Cameras
 from extrags.gaussians import Gaussians
 from extrags.illumination import NearFieldLight
-from extrags.raster import rasterize
+from extrags.raster import Rendering, rasterize
 from extrags.scene import Scene
+from extrags.threads import torch_threads
 
 
 def _scene_and_cameras() -> tuple[Scene, Cameras]:
@@ -78,3 +81,20 @@ def test_a_scene_in_float64_is_rendered_by_cameras_in_float64() -> None:
         assert double.dtype == torch.float64
         torch.testing.assert_close(double.float(), single, rtol=1e-4, atol=1e-5)
         assert not torch.equal(wide.render(nearby).rgb, double)
+
+
+def test_torch_computes_in_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Where torch divides its work, sigmoids differ by a rounding, and a training makes that visible.
+    scene, cameras = _scene_and_cameras()
+    threads = []
+
+    def recorded(*arguments: Any, **options: Any) -> Rendering:
+        threads.append(torch.get_num_threads())
+        return rasterize(*arguments, **options)
+
+    monkeypatch.setattr("extrags.scene.rasterize", recorded)
+    with torch_threads(2):
+        scene.render(cameras)
+        scene.render_attributes(cameras, torch.ones(40, 1))
+        assert torch.get_num_threads() == 2
+    assert threads == [1, 1]

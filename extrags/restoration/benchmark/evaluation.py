@@ -36,7 +36,7 @@ from extrags.restoration.benchmark.inconsistency import (
 )
 from extrags.restoration.benchmark.realism import Realism, rims
 from extrags.restoration.clips import as_images, as_planes, keep_known, render_clips
-from extrags.restoration.protocol import Clip, Enhancer
+from extrags.restoration.protocol import Clip, Enhancer, restore_clip
 from extrags.restoration.uncertainty.reliability_diagram import calibration, cell_correlation
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
@@ -200,7 +200,7 @@ def restore_views(enhancer: Enhancer, clips: Sequence[Clip]) -> RestoredViews:
     restorations, targets, seconds = [], [], []
     for clip in clips:
         begun = time.perf_counter()
-        restoration = enhancer.restore(clip)
+        restoration = restore_clip(enhancer, clip)
         seconds.append((time.perf_counter() - begun) / len(clip))
         restorations.append(restoration)
         rendered = as_images(clip.layers.get("rendered").clamp(0, 1))
