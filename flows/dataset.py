@@ -13,7 +13,7 @@ from prefect.client.schemas.objects import State
 from pydantic import Field
 
 from extrags.config import ProfileName, Seed
-from extrags.pipeline import StageName
+from extrags.stages import StageName
 from extrags.store import Store
 from flows.cases import Only, SequenceCase, cases_of, record_outcome_quietly, selected
 from flows.damage import again_after_damage

@@ -34,7 +34,7 @@ from flows.failures import describe_error
 from flows.outcome import DatasetFailedError, DatasetOutcome, SequenceOutcome, StageRow
 
 if TYPE_CHECKING:
-    from extrags.pipeline import StageName
+    from extrags.stages import StageName
     from flows.cases import SequenceCase
 
 __all__ = ["Several", "add_arguments", "execute", "parsed_matrix", "parsed_methods", "run"]
@@ -366,12 +366,12 @@ def _wrong_source(case: SequenceCase, until: StageName) -> SequenceOutcome | Non
     """How a run would fail whose source can be seen to be wrong without reading pictures; else None."""
     from data_catalog import glance
     from data_catalog.names import plain_name
-    from extrags.pipeline import STAGES
+    from extrags.stages import stages_until
 
     try:
         glance(case.sequence, case.config().ingest)
     except SourceError as error:
-        rest = STAGES[1 : STAGES.index(until) + 1]
+        rest = stages_until(until)[1:]
         rows = [StageRow("ingest", "failed", reason=str(error))]
         rows += [StageRow(stage, "skipped", reason="ingest failed") for stage in rest]
         return SequenceOutcome(plain_name(case.sequence), "failed", rows, error=error)
