@@ -40,7 +40,6 @@ from extrags.in_memory_pipeline import Result, run_pipeline
 from extrags.metrics.image import means_in_regions
 from extrags.metrics.protocol import EvaluationResult, RenderedViews
 from extrags.metrics.registry import Metric, register_metric
-from extrags.pipeline import STAGES
 from extrags.poses import PoseEstimate, estimate_poses, with_estimated_poses
 from extrags.pseudo_views import PseudoViews
 from extrags.raster import Rendering, rasterize
@@ -49,6 +48,7 @@ from extrags.restoration.trajectories import restore
 from extrags.scene import Scene
 from extrags.scene_plan import ScenePlan
 from extrags.sequence import EndoscopicSequence, Split
+from extrags.stages import STAGES
 from extrags.surface import Mesh, fuse_surface
 from extrags.training import TrainingResult, finetune, reconstruct
 

@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, TypeVar
 
 from extrags.config import PROFILES, PipelineConfig
 from extrags.errors import CaptureError, ConfigError
-from extrags.pipeline import Pipeline, StageName
+from extrags.pipeline import Pipeline
+from extrags.stages import StageName
 
 if TYPE_CHECKING:
     from extrags.baselines.uc_nerf.training import UcNerfResult

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 from extrags.config import PipelineConfig
 from extrags.frame_stacks import MAPPED_BYTES
-from extrags.pipeline import STAGES, StageName
+from extrags.stages import StageName, stages_until
 
 __all__ = ["FrameSize", "MemoryEstimate", "estimate_memory", "fitting_settings"]
 
@@ -191,7 +191,7 @@ def estimate_memory(
         "evaluate": whole + max(stacks * rendered + metrics, rendered + restored),
         "report": whole + 2 * rendered,
     }
-    wanted = [stage for stage in STAGES[: STAGES.index(until) + 1] if stage not in leave_out]
+    wanted = [stage for stage in stages_until(until) if stage not in leave_out]
     return MemoryEstimate({stage: round(found[stage]) for stage in wanted if stage in found})
 
 

@@ -1,11 +1,11 @@
-"""The stages of a sequence: their order, and which of them run.
+"""The stages of a sequence: what runs them, and which of them run.
 
-`Pipeline` alone defines the order of the stages and the rules by which one is skipped. It has two subclasses:
-`extrags.in_memory_pipeline.InMemoryPipeline`, behind `run_pipeline`, calls the library and keeps the results
-in memory; `flows.wiring.SequenceRun` computes the same results as cached tasks, with the same functions of
-the library.
+`extrags.stages` has the order of the stages, `Pipeline` alone the rules by which one is skipped. It has two
+subclasses: `extrags.in_memory_pipeline.InMemoryPipeline`, behind `run_pipeline`, calls the library and keeps
+the results in memory; `flows.wiring.SequenceRun` computes the same results as cached tasks, with the same
+functions of the library.
 
-This module loads nothing heavy by itself, so that flows and the command line can read the list of stages.
+This module loads nothing heavy by itself, so that flows and the command line can read the rules.
 """
 
 from __future__ import annotations
@@ -13,62 +13,29 @@ from __future__ import annotations
 import logging
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping
-from typing import TYPE_CHECKING, Literal, TypeVar, get_args
+from typing import TYPE_CHECKING
 
 from extrags.config import PipelineConfig
 from extrags.errors import ConfigError
+from extrags.stages import REGISTRY, StageName, leading_to, stage_named, stages_until
 
 if TYPE_CHECKING:
     from extrags.scene_plan import Decision, ScenePlan
 
 __all__ = [
     "HELD_OUT_TRAINED_ON",
-    "STAGES",
+    "NO_GAUSSIANS",
     "Pipeline",
-    "StageName",
-    "check_stage",
     "needs_plan",
 ]
 
 log = logging.getLogger(__name__)
 
-T = TypeVar("T")
-
-StageName = Literal[
-    "ingest",
-    "poses",
-    "depth",
-    "coarse",
-    "assess",
-    "surface",
-    "freespace",
-    "explore",
-    "enhance",
-    "finetune",
-    "evaluate",
-    "report",
-]
-
-STAGES: tuple[StageName, ...] = get_args(StageName)
-"""All stages, in the order they run."""
-
-INDISPENSABLE: frozenset[StageName] = frozenset({"ingest", "coarse"})
-"""Stages that every other one rests on."""
-
-NEEDS: dict[StageName, StageName] = {"freespace": "surface", "explore": "freespace", "enhance": "explore"}
-"""What a stage cannot do without, besides the indispensable ones; skipped with it."""
-
 HELD_OUT_TRAINED_ON = "oracle: held-out frames were trained on"
 """Said wherever figures of such a scene are shown."""
 
-AFTER_COARSE: tuple[StageName, ...] = ("surface", "freespace", "explore", "enhance", "finetune")
-"""The stages that the plan decides on."""
-
-NEED_GAUSSIANS: tuple[StageName, ...] = ("assess", "surface", "freespace", "explore", "enhance", "finetune")
-"""Stages that work on Gaussians; skipped where the scene is a radiance field."""
-
 NO_GAUSSIANS = "the scene is a radiance field, and the stage needs Gaussians"
-"""Why they are."""
+"""Why stages that need some are skipped then."""
 
 
 class Pipeline(ABC):
@@ -92,12 +59,13 @@ class Pipeline(ABC):
         self.plan: ScenePlan | None = None
         self.skipped: set[StageName] = set()
         for stage in self.leave_out:
-            check_stage(stage)
-            if stage in INDISPENSABLE:
+            if stage_named(stage).indispensable:
                 raise ConfigError(f"the stage {stage} cannot be left out: everything rests on it")
         config.check_imported()
         if config.coarse.train_on == "all":
-            resting: list[str] = [stage for stage in AFTER_COARSE if stage not in self.leave_out]
+            resting: list[str] = [
+                stage.name for stage in REGISTRY if stage.planned and stage.name not in self.leave_out
+            ]
             resting += ["coarse.refine_poses"] if config.coarse.refine_poses else []
             if resting:
                 raise ConfigError(
@@ -112,8 +80,7 @@ class Pipeline(ABC):
         Raises:
             ConfigError: for a stage that does not exist.
         """
-        check_stage(until)
-        for stage in STAGES[: STAGES.index(until) + 1]:
+        for stage in stages_until(until):
             reason = self.reason_to_skip(stage)
             if reason is None:
                 getattr(self, stage)()
@@ -129,7 +96,8 @@ class Pipeline(ABC):
             return self.leave_out[stage]
         if stage == "assess" and not needs_plan(self.leave_out):
             return "no stage of this run depends on the plan"
-        if stage in NEED_GAUSSIANS and self.config.uc_nerf.enabled:
+        described = stage_named(stage)
+        if described.needs_gaussians and self.config.uc_nerf.enabled:
             return NO_GAUSSIANS
         planned = self.planned(stage)
         # Stages are left out to compare methods. The remaining stages then run regardless of the plan, so
@@ -141,8 +109,8 @@ class Pipeline(ABC):
         lost = "enhance" not in self.leave_out and "enhance" in self.skipped
         if stage == "finetune" and lost and self.leave_out:
             return "there are no virtual views"
-        if stage in NEEDS and NEEDS[stage] in self.skipped:
-            return f"it needs the stage {NEEDS[stage]}, which was skipped"
+        if described.needs in self.skipped:
+            return f"it needs the stage {described.needs}, which was skipped"
         if stage == "poses" and self.has_poses() and not self.config.poses.replace_given:
             unused = self.config.poses.working_distance_mm is not None
             return "the source has poses" + ("; poses.working_distance_mm is of no use" if unused else "")
@@ -250,20 +218,10 @@ class Pipeline(ABC):
         """Write the HTML report of the run."""
 
 
-def check_stage(stage: str) -> None:
-    """Check the name of a stage.
-
-    Raises:
-        ConfigError: for an unknown stage; lists the valid names.
-    """
-    if stage not in STAGES:
-        raise ConfigError(f"no stage {stage!r}; known: {', '.join(STAGES)}")
-
-
 def needs_plan(leave_out: Collection[str]) -> bool:
     """Whether a run that leaves these stages out depends on the plan.
 
     With any stage left out the plan skips none of the others (`Pipeline.reason_to_skip`). What it then still
     sets are the budgets of exploration and of what follows it.
     """
-    return not leave_out or not {"assess", "surface", "freespace", "explore"}.intersection(leave_out)
+    return not leave_out or not {"assess", *leading_to("explore")}.intersection(leave_out)

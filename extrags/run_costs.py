@@ -22,15 +22,13 @@ import numpy as np
 from extrags.config import PipelineConfig
 from extrags.errors import ConfigError
 from extrags.frame_stacks import MAPPED_BYTES
+from extrags.stages import cost_of, modelled_tasks, stage_of_task
 
 if TYPE_CHECKING:
     from extrags.raster.bench import BenchSize
 
 __all__ = [
     "MEMORY_TERMS",
-    "RENDERING",
-    "STAGE_TASKS",
-    "TIME_TERMS",
     "CostModel",
     "TaskCost",
     "Workload",
@@ -43,82 +41,14 @@ __all__ = [
     "stage_tasks",
 ]
 
-STAGE_TASKS: dict[str, tuple[str, ...]] = {
-    "ingest": ("ingest", "training-frames"),
-    "poses": ("poses",),
-    "depth": ("depth", "depth-frames"),
-    "coarse": ("coarse",),
-    "assess": ("assess", "plan"),
-    "surface": ("surface",),
-    "freespace": ("freespace",),
-    "explore": ("explore",),
-    "enhance": ("enhance-train", "enhance"),
-    "finetune": ("finetune-judge", "finetune"),
-    "evaluate": ("evaluate-render", "evaluate-restore", "evaluate-views", "evaluate"),
-    "report": ("report",),
-}
-"""The tasks of each stage that are modelled. `explore` stands for all of its waves, `enhance` for the
-restoration of all batches and their assembly; evaluation counts once for each set of views that is measured,
-`evaluate-restore` once where there is a restorer."""
-
-TIME_TERMS: dict[str, tuple[str, ...]] = {
-    "ingest": ("one", "frames", "frames*pixels"),
-    "poses": ("one", "frames", "frames*pixels"),
-    "depth": ("one", "train", "train*pixels"),
-    "training-frames": ("one", "train*pixels"),
-    "coarse": (
-        "one",
-        "train*pixels",
-        "iterations",
-        "iterations*pixels",
-        "iterations*gaussians",
-        "iterations*coefficients",
-    ),
-    "assess": ("one", "gaussians"),
-    "surface": ("one", "train*pixels", "gaussians"),
-    "freespace": ("one", "gaussians"),
-    "explore": ("branches", "branches*gaussians"),
-    "enhance-train": (
-        "one",
-        "train*pixels",
-        "restored",
-        "fold_iterations",
-        "fold_iterations*restored",
-        "fold_iterations*gaussians",
-    ),
-    "enhance": ("one", "views", "views*restored", "views*restored*samples"),
-    "finetune-judge": (
-        "train*pixels",
-        "judge_iterations",
-        "judge_iterations*pixels",
-        "judge_iterations*gaussians",
-        "judge_iterations*final_gaussians",
-    ),
-    "finetune": ("train*pixels", "tuning", "tuning*pixels", "tuning*restored", "tuning*final_gaussians"),
-    "evaluate-render": ("test", "test*pixels"),
-    "evaluate-restore": ("test*pixels", "test*restored"),
-    "evaluate-views": ("test*pixels*stacks", "test*pixels*vgg*passes"),
-    "evaluate": ("one",),
-    "report": ("one", "frames*pixels"),
-}
-"""Terms of the time of each task; others have a constant alone. Terms that records cannot tell apart (one
-number of iterations only) must not be there: the fit would give one of them the part of the other. What was
-measured by itself, as the runs of the restoring network beyond the first, is in `run_costs.json` alone."""
 MEMORY_TERMS = ("one", "pixels", "held_pixels", "restored", "train*restored", "gaussians")
-"""Terms of the memory of each task; those of `OF_FINAL_SCENE` depend on the Gaussians of the final scene."""
+"""Terms of the memory of each task; of some, of the Gaussians of the final scene."""
 EVALUATION_TERMS = ("pixels*stacks", "pixels*vgg")
 """Further terms of the memory of what evaluates."""
 HELD_PIXELS = MAPPED_BYTES / 3
 """Of all frames together, at most: the images of more are a mapped file, which the memory does not count."""
-RESTORING = frozenset({"enhance-train", "enhance", "finetune-judge", "evaluate-restore"})
-"""Tasks that prepare the restorer of `enhance.backend`, or run it."""
-RENDERING = frozenset(
-    {"coarse", "assess", "surface", "freespace", "explore", "finetune-judge", "finetune", "evaluate-render"}
-)
-"""Tasks whose time is that of the rasteriser."""
 FITTED_BACKEND = "embedded"
 """The only one that there are records of."""
-OF_FINAL_SCENE = frozenset({"finetune", "evaluate-render", "evaluate-restore", "evaluate-views", "evaluate"})
 GAUSSIANS_WANTED = (51_000, 5000, 0.39)
 """So many, after so many iterations, and the power by which they grow with these: where densification ends
 without a limit. In ten scenes of 160 x 128 to 675 x 540 px it depended on neither size nor number of frames
@@ -341,11 +271,7 @@ class CostModel:
 
 def stage_tasks(stage: str, config: PipelineConfig) -> tuple[str, ...]:
     """The tasks of a stage that are modelled and that these settings run."""
-    left_out = set() if config.finetune.judge.enabled else {"finetune-judge"}
-    left_out |= {"evaluate-restore"} if config.evaluate.restored == "none" else set()
-    # It prepares nothing.
-    left_out |= {"enhance-train"} if config.enhance.backend == "classical" else set()
-    return tuple(task for task in STAGE_TASKS[stage] if task not in left_out)
+    return tuple(task for task, cost in modelled_tasks(stage).items() if cost.runs(config))
 
 
 def beyond_the_fit(task: str, config: PipelineConfig) -> tuple[str, ...]:
@@ -357,11 +283,12 @@ def beyond_the_fit(task: str, config: PipelineConfig) -> tuple[str, ...]:
         Names and values, in words; empty where the coefficients hold.
     """
     enhance = config.enhance
+    restores = cost_of(task).restores
     found = []
-    if task in RESTORING and enhance.backend != FITTED_BACKEND:
+    if restores and enhance.backend != FITTED_BACKEND:
         found.append(f"enhance.backend={enhance.backend}")
     # A restorer that was trained may have been found to be best with more steps.
-    elif task == "enhance-train" or (task in RESTORING and enhance.steps == "auto"):
+    elif task == "enhance-train" or (restores and enhance.steps == "auto"):
         found += [f"enhance.train_iterations={enhance.train_iterations}"] * (enhance.train_iterations > 0)
     if task in ("finetune", "finetune-judge") and config.finetune.keep_scene:
         found.append("finetune.keep_scene=true")
@@ -401,7 +328,7 @@ def fitted(history: Sequence[tuple[Workload, TaskCost]], probe_s: float) -> Cost
     for task, records in sorted(by_task.items()):
         timed = [(work, cost.seconds) for work, cost in records if cost.seconds > 0]
         if timed:
-            time[task] = _fit(TIME_TERMS.get(task, ("one",)), timed)
+            time[task] = _fit(cost_of(task).terms, timed)
         sized = [(work, cost.peak_mib) for work, cost in records if cost.peak_mib]
         if sized:
             memory[task] = _fit(memory_terms(task), sized)
@@ -410,9 +337,10 @@ def fitted(history: Sequence[tuple[Workload, TaskCost]], probe_s: float) -> Cost
 
 def memory_terms(task: str) -> tuple[str, ...]:
     """Terms of the memory of a task."""
-    if task not in OF_FINAL_SCENE:
+    if not cost_of(task).of_final_scene:
         return MEMORY_TERMS
-    measured = EVALUATION_TERMS if task.startswith("evaluate") else ()
+    stage = stage_of_task(task)
+    measured = EVALUATION_TERMS if stage is not None and stage.name == "evaluate" else ()
     return (*("final_gaussians" if term == "gaussians" else term for term in MEMORY_TERMS), *measured)
 
 

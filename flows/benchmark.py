@@ -12,7 +12,7 @@ from prefect import flow
 from prefect.artifacts import create_markdown_artifact
 from pydantic import Field
 
-from extrags.config import ProfileName, Seed
+from extrags.config import PipelineConfig, ProfileName, Seed
 from extrags.errors import ConfigError
 from extrags.pipeline import HELD_OUT_TRAINED_ON
 from extrags.redaction import without_credentials_in
@@ -37,7 +37,7 @@ from flows.parameters import Sequences, Settings, StoreRoot, Variants
 from flows.preflight import preflight
 from flows.run_page import run_page
 from flows.runners import PrefectRunner, Runner
-from flows.selection import chosen_sequences
+from flows.selection import Chosen, chosen_sequences
 from flows.sequence import open_store
 from flows.settings import run_store
 from flows.tables import benchmark_markdown, judgement_markdown
@@ -142,16 +142,7 @@ def benchmark(
     open_store(store)
     runner = PrefectRunner(store, refresh, limits)
     wanted = [*methods, *(variants or {})]
-    # Invalid settings and missing models are reported before the first run, once for all sequences alike.
-    unlike = {digest_of(item.settings): item for item in chosen}.values()
-    for item, profile, method in product(unlike, profiles, wanted):
-        try:
-            for seed in seeds:
-                config = _config_of(method, profile, item.settings, variants or {}, seed)
-        except ConfigError as error:
-            shared = item.settings == (settings or {})
-            raise ConfigError(str(error) if shared else f"{item.name}: {error}") from error
-        preflight(config, "evaluate", METHODS[_variant(method, variants or {})[0]].leave_out)
+    config = _checked_config(chosen, profiles, wanted, seeds, settings or {}, variants or {})
     words = {method: summary_of(method, variants or {}) for method in wanted}
     # Here and below, because they load torch and the kernels, which looking up a deployment must not.
     from extrags.raster.bench import machine
@@ -159,7 +150,7 @@ def benchmark(
     about = machine()
     earlier = history_of(Store(store), name) if refresh else []
 
-    def run_all() -> tuple[list[dict[str, Any]], dict[str, Any], Judgement, str]:
+    def run_all() -> tuple[_Accounts, str]:
         page.restart()
         found = []
         for item, profile, seed, method in product(chosen, profiles, seeds, wanted):
@@ -176,43 +167,121 @@ def benchmark(
             )
             page.sequence_ended(case.outcome, store)
             found.append(case)
-        cases = [case_of(case) for case in found]
-        digests = [{"asked": case.asked, "settings": case.settings} for case in found]
-        entry = history_entry(name, cases, digests, about)
-        judgement = Judgement() if tolerance is None else judge(entry, earlier, tolerance)
-        history = {"trend": trend([*earlier, entry]), **asdict(judgement)} if refresh else {}
+        accounts = _accounts(name, found, about, earlier, tolerance)
+        history: dict[str, Any] = {}
+        if refresh:
+            history = {"trend": trend([*earlier, accounts.entry]), **asdict(accounts.judgement)}
         outcomes = [case.outcome for case in found]
-        report = benchmark_page(outcomes, cases, words, baseline, name, runner, history)
-        return cases, entry, judgement, report
+        return accounts, benchmark_page(outcomes, accounts.cases, words, baseline, name, runner, history)
 
     runs = len(chosen) * len(profiles) * len(seeds) * len(wanted)
     with run_lease(store), run_page(name, config, "evaluate", sequences=runs) as page:
-        cases, entry, judgement, report = again_after_damage(Store(store), run_all)
+        accounts, report = again_after_damage(Store(store), run_all)
         page.link(report, artifact_key("report", name), f"Report of {name}")
     if refresh:
-        append_history(Store(store), entry)
-    for line in judgement.not_judged:
-        log.warning("not judged: %s", line)
-    attempt(
-        lambda: create_markdown_artifact(
-            benchmark_markdown(cases, baseline) + judgement_markdown(judgement),
-            key=artifact_key("benchmark", name),
-            description=f"{len(cases)} runs",
-        )
-    )
+        append_history(Store(store), accounts.entry)
+    _tell(name, accounts, baseline)
     from extrags.metrics.comparison import compare_runs
 
     result = {
         "machine": about,
         "methods": words,
-        "cases": cases,
-        "comparison": compare_runs(cases, baseline),
-        **asdict(judgement),
+        "cases": accounts.cases,
+        "comparison": compare_runs(accounts.cases, baseline),
+        **asdict(accounts.judgement),
         "report": report,
     }
-    if judgement.regressions:
+    if accounts.judgement.regressions:
         raise BenchmarkRegressedError(name, result)
     return result
+
+
+def _checked_config(
+    chosen: Sequence[Chosen],
+    profiles: Sequence[str],
+    wanted: Sequence[str],
+    seeds: Sequence[int],
+    settings: dict[str, Any],
+    variants: dict[str, dict[str, Any]],
+) -> PipelineConfig:
+    """Report invalid settings and missing models before the first run, once for all sequences alike.
+
+    Args:
+        chosen: the sequences, each with all settings that are given for it.
+        profiles: named settings.
+        wanted: methods and variants, by name.
+        seeds: of all stages.
+        settings: those that are given for all sequences.
+        variants: by name, what they change.
+
+    Returns:
+        Settings of the last run.
+
+    Raises:
+        ConfigError: for a setting that is wrong; names the sequence where it is given for that one alone.
+        ExtragsError: see `flows.preflight.preflight`.
+    """
+    unlike = {digest_of(item.settings): item for item in chosen}.values()
+    for item, profile, method in product(unlike, profiles, wanted):
+        try:
+            for seed in seeds:
+                config = _config_of(method, profile, item.settings, variants, seed)
+        except ConfigError as error:
+            shared = item.settings == settings
+            raise ConfigError(str(error) if shared else f"{item.name}: {error}") from error
+        preflight(config, "evaluate", METHODS[_variant(method, variants)[0]].leave_out)
+    return config
+
+
+@dataclass(frozen=True)
+class _Accounts:
+    """What the runs of a benchmark came to.
+
+    Args:
+        cases: `case_of` of each.
+        entry: of the history.
+        judgement: against the runs before.
+    """
+
+    cases: list[dict[str, Any]]
+    entry: dict[str, Any]
+    judgement: Judgement
+
+
+def _accounts(
+    name: str,
+    found: Sequence[Case],
+    about: dict[str, Any],
+    earlier: list[dict[str, Any]],
+    tolerance: Tolerance | None,
+) -> _Accounts:
+    """Account for the runs of a benchmark.
+
+    Args:
+        name: of the benchmark.
+        found: its runs.
+        about: the machine.
+        earlier: entries of the history.
+        tolerance: how much worse than these it may be; None: not held against them.
+    """
+    cases = [case_of(case) for case in found]
+    digests = [{"asked": case.asked, "settings": case.settings} for case in found]
+    entry = history_entry(name, cases, digests, about)
+    judgement = Judgement() if tolerance is None else judge(entry, earlier, tolerance)
+    return _Accounts(cases, entry, judgement)
+
+
+def _tell(name: str, accounts: _Accounts, baseline: str) -> None:
+    """Log what could not be judged, and leave the tables as an artifact."""
+    for line in accounts.judgement.not_judged:
+        log.warning("not judged: %s", line)
+    attempt(
+        lambda: create_markdown_artifact(
+            benchmark_markdown(accounts.cases, baseline) + judgement_markdown(accounts.judgement),
+            key=artifact_key("benchmark", name),
+            description=f"{len(accounts.cases)} runs",
+        )
+    )
 
 
 def check_methods(
@@ -351,7 +420,7 @@ def _config_of(
     settings: dict[str, Any] | None,
     variants: dict[str, dict[str, Any]],
     seed: int,
-) -> Any:
+) -> PipelineConfig:
     base, changed = _variant(method, variants)
     # A variant is a method with something changed: its settings come last.
     return method_config(base, profile, settings, seed).with_overrides(changed)

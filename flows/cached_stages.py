@@ -10,13 +10,14 @@ from typing import Any
 from data_catalog.names import plain_name
 from extrags.config import PipelineConfig
 from extrags.errors import ArtefactGoneError, DamagedArtefactError, ExtragsError
-from extrags.pipeline import STAGES, Pipeline, StageName
+from extrags.pipeline import Pipeline
 from extrags.redaction import without_credentials
+from extrags.stages import Part, StageName, stages_until
 from extrags.store import Manifest, Ref, Store, digest_of, forget_loaded
 from extrags.store.runs import RunRecord, recorded_run
 from flows.damage import again_after_damage
 from flows.estimate import expected_seconds
-from flows.outcome import Part, SequenceOutcome, StageRow
+from flows.outcome import SequenceOutcome, StageRow
 from flows.runners import Call, NotInStoreError, Result, Runner, StoreRunner
 from flows.workloads import frames_work
 from tasks.progress import StageProgress, notify
@@ -85,7 +86,7 @@ class CachedStages(Pipeline):
             self.outcome.status = "failed"
             done = {row.stage for row in self.outcome.stages}
             failed = self.outcome.stages[-1].stage
-            for stage in STAGES[: STAGES.index(until) + 1]:
+            for stage in stages_until(until):
                 if stage not in done:
                     self.skip(stage, f"{failed} failed")
         finally:

@@ -13,7 +13,7 @@ from data_catalog.names import path_of
 from extrags import __version__
 from extrags.config import PipelineConfig
 from extrags.errors import ConfigError, DamagedArtefactError, StoreError
-from extrags.pipeline import STAGES, StageName
+from extrags.stages import STAGES, StageName
 from extrags.store import Store, digest_of, read_records, write_record
 from extrags.store.records import remove_record
 from flows.estimate import expected_seconds

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
 from typing import Annotated, Any
@@ -13,11 +14,11 @@ from prefect.client.schemas.objects import State
 from pydantic import Field
 
 from extrags.config import ProfileName, Seed
-from extrags.pipeline import StageName
+from extrags.stages import StageName
 from extrags.store import Store
 from flows.cases import Only, SequenceCase, cases_of, record_outcome_quietly, selected
 from flows.damage import again_after_damage
-from flows.expectation import expectations, expected_words, longest_first
+from flows.expectation import Expectation, expectations, expected_words, longest_first
 from flows.leases import run_lease
 from flows.limits import DEFAULT_LIMITS, StageLimits
 from flows.methods import METHODS, MethodName, profile_label
@@ -94,7 +95,6 @@ def reconstruct_dataset(
             been written by then.
     """
     store = run_store(store)
-    # Invalid settings, missing models and a read-only store affect all sequences: report them once.
     every = cases_of(
         chosen_sequences(sequences),
         methods=methods or [method],
@@ -103,10 +103,7 @@ def reconstruct_dataset(
         settings=settings or {},
         matrix=matrix,
     )
-    open_store(store)
-    for wanted in dict.fromkeys(case.method for case in every):
-        first = next(case for case in every if case.method == wanted)
-        preflight(first.config(), until, METHODS[wanted].leave_out)
+    _check(every, store, until)
     cases = selected(every, only, store, until)
     expected = expectations(cases, store, until, refresh=refresh)
     if cases:
@@ -130,11 +127,8 @@ def reconstruct_dataset(
             variant=dict(case.changed) or None,
             return_state=True,
         )
-        outcome = outcome_of(case.sequence, state)
-        outcome.variant = case.variant
+        outcome = _case_outcome(case, state, store, until)
         outcome.seed = case.seed if len(seeds or ()) > 1 else None
-        if not isinstance(state.result(raise_on_failure=False), SequenceOutcome | SequenceFailedError):
-            record_outcome_quietly(Store(store), case, outcome, until, case.config())
         page.sequence_ended(outcome, store)
         return outcome
 
@@ -143,19 +137,7 @@ def reconstruct_dataset(
         if at_once == 1:
             outcomes = [reconstruct(case) for case in cases]
         else:
-            with ThreadPoolExecutor(max_workers=at_once) as pool:
-                try:
-                    # Flow and observer are in context variables, which threads do not inherit.
-                    futures = {
-                        item.case.title: pool.submit(copy_context().run, reconstruct, item.case)
-                        for item in longest_first(expected)
-                    }
-                    outcomes = [futures[case.title].result() for case in cases]
-                except BaseException:
-                    # SIGTERM or Ctrl-C, say: what has begun ends at its next event, and nothing else begins.
-                    with stages_interrupted():
-                        pool.shutdown(cancel_futures=True)
-                    raise
+            outcomes = _side_by_side(reconstruct, expected, at_once)
         report = None
         if until == "report":
             label = profile_label(profile, method if methods is None else ", ".join(methods))
@@ -183,6 +165,52 @@ def reconstruct_dataset(
     if found.failed_share > max_failed_share:
         raise DatasetFailedError(found, max_failed_share)
     return found
+
+
+def _check(cases: Sequence[SequenceCase], store: str, until: StageName) -> None:
+    """Report what affects all sequences once: invalid settings, missing models and a read-only store.
+
+    Raises:
+        ExtragsError: see `flows.sequence.open_store` and `flows.preflight.preflight`.
+    """
+    open_store(store)
+    for method in dict.fromkeys(case.method for case in cases):
+        first = next(case for case in cases if case.method == method)
+        preflight(first.config(), until, METHODS[method].leave_out)
+
+
+def _side_by_side(
+    reconstruct: Callable[[SequenceCase], SequenceOutcome], expected: Sequence[Expectation], at_once: int
+) -> list[SequenceOutcome]:
+    """Run cases in threads, those that take longest first.
+
+    Args:
+        reconstruct: runs one.
+        expected: the cases, in the order of the outcomes.
+        at_once: in work at the same time.
+    """
+    with ThreadPoolExecutor(max_workers=at_once) as pool:
+        try:
+            # Flow and observer are in context variables, which threads do not inherit.
+            futures = {
+                item.case.title: pool.submit(copy_context().run, reconstruct, item.case)
+                for item in longest_first(expected)
+            }
+            return [futures[item.case.title].result() for item in expected]
+        except BaseException:
+            # SIGTERM or Ctrl-C, say: what has begun ends at its next event, and nothing else begins.
+            with stages_interrupted():
+                pool.shutdown(cancel_futures=True)
+            raise
+
+
+def _case_outcome(case: SequenceCase, state: State[Any], store: str, until: StageName) -> SequenceOutcome:
+    """The outcome of the flow run of a case; one that could not leave its record itself is recorded here."""
+    outcome = outcome_of(case.sequence, state)
+    outcome.variant = case.variant
+    if not isinstance(state.result(raise_on_failure=False), SequenceOutcome | SequenceFailedError):
+        record_outcome_quietly(Store(store), case, outcome, until, case.config())
+    return outcome
 
 
 def outcome_of(sequence: str, state: State[Any]) -> SequenceOutcome:

@@ -8,16 +8,13 @@ from itertools import takewhile
 
 from extrags.config import PipelineConfig
 from extrags.cores import usable_cores
-from extrags.pipeline import STAGES, StageName
 from extrags.run_costs import Workload, packaged_model, stage_tasks
+from extrags.stages import STAGES, StageName, all_tasks, cost_of, stages_until
 from flows.workloads import task_repeats, usual_work
 from tasks.progress import StageProgress, duration_text
 
 __all__ = ["RunEstimate", "SequenceEstimate", "expected_seconds", "usual_pace", "without_kernels_in_words"]
 
-OTHER_SECONDS: dict[str, float] = {"depth": 30.0, "report": 4.0}
-"""Of processor time: tasks whose cost no model knows, for a recording of the phantom. Depth grows with the
-pixels of all frames, as far as it looks at them (`depth.max_width`)."""
 FEATURE_SECONDS_PER_PX = 3.9e-6
 MAPPING_SECONDS = 0.1
 """Of a frame."""
@@ -28,13 +25,10 @@ features of 1920 x 1080: 8 s a frame), which they give within a quarter."""
 USUAL_FEATURES = 6000
 FEATURES_PER_PX = 0.04
 """About so many are found in small frames."""
-RESTORATION = {"enhance-keyframes": 0.1, "enhance-restore": 0.8, "enhance": 0.1}
-"""Shares of its tasks in the time of the restoration, which is modelled as one."""
-
 MEASURED_SCENES = 2
 """The coarse and the final scene."""
 
-SEVERAL_LOOPS = frozenset({"enhance-train", "finetune-judge"})
+SEVERAL_LOOPS = frozenset(task.name for task in all_tasks() if task.several_loops)
 """Tasks that count one thing after another: no count tells how far they are, only their time does."""
 
 USUAL_PACE_SECONDS = 10.0
@@ -60,6 +54,7 @@ def expected_seconds(
     """
     model, work = packaged_model(), usual_work(config) if work is None else work
     usual = usual_work(config)
+    # Depth grows with the pixels of all frames, as far as it looks at them.
     larger = {"depth": _pixels_of_depth(work) * work.train / (_pixels_of_depth(usual) * usual.train)}
     found: dict[StageName, dict[str, float]] = {}
     restored = int(config.evaluate.restored != "none")
@@ -71,13 +66,14 @@ def expected_seconds(
         for task, times in repeats.items():
             if task not in run:
                 continue
+            cost = cost_of(task)
             if task == "poses":
                 seconds = _seconds_of_poses(work)
-            elif task in model.time and stage not in OTHER_SECONDS:
+            elif task in model.time and not cost.unfitted:
                 seconds = times * model.predict(task, work).seconds
             else:
-                seconds = OTHER_SECONDS.get(task, 0.0) * larger.get(stage, 1.0)
-            for part, share in (RESTORATION if task == "enhance" else {task: 1.0}).items():
+                seconds = (cost.usual_s or 0.0) * larger.get(task, 1.0)
+            for part, share in (cost.shares or {task: 1.0}).items():
                 tasks[part] = share * seconds
         found[stage] = tasks
     return found
@@ -207,8 +203,11 @@ class SequenceEstimate:
         return took / expected
 
     def _stages(self) -> list[StageName]:
-        wanted = STAGES[: STAGES.index(self.until) + 1]
-        return [stage for stage in wanted if stage not in self.ended or self.ended[stage].state != "skipped"]
+        return [
+            stage
+            for stage in stages_until(self.until)
+            if stage not in self.ended or self.ended[stage].state != "skipped"
+        ]
 
     def _tasks(self, stage: str) -> dict[str, float]:
         return next((tasks for name, tasks in self.expected.items() if name == stage), {})

@@ -10,8 +10,8 @@ from statistics import median
 from data_catalog.names import comparable_name
 from extrags.config import PipelineConfig
 from extrags.errors import ExtragsError
-from extrags.pipeline import STAGES, StageName
 from extrags.run_costs import Workload
+from extrags.stages import STAGES, StageName, stages_until
 from extrags.store import Store, digest_of
 from flows.cases import SequenceCase
 from flows.estimate import expected_seconds, usual_pace, without_kernels_in_words
@@ -73,7 +73,7 @@ def expectations(
             found.append(Expectation(case, 0.0, measured=True))
             continue
         left_out = METHODS[case.method].leave_out
-        wanted = [stage for stage in STAGES[: STAGES.index(until) + 1] if stage not in left_out]
+        wanted = [stage for stage in stages_until(until) if stage not in left_out]
         earlier = [*([own] if own is not None else []), *by_sequence.get(comparable_name(case.sequence), [])]
         times = _measured(earlier)
         local = _pace(earlier) or pace or usual_pace()
@@ -124,9 +124,8 @@ def expected_words(expected: Sequence[Expectation], at_once: int = 1, *, process
 
 
 def _is_finished(record: OutcomeRecord, config: PipelineConfig, until: StageName, keys: set[str]) -> bool:
-    reached = STAGES.index(record["until"]) >= STAGES.index(until)
     return (
-        reached
+        until in stages_until(record["until"])
         and record["status"] == "ok"
         and record["config"] == digest_of(config)
         and all(key in keys for row in record["stages"] for key in row["artefacts"])

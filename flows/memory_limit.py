@@ -10,7 +10,7 @@ from extrags.config import PipelineConfig
 from extrags.cores import usable_cores
 from extrags.errors import ConfigError, DamagedArtefactError
 from extrags.memory_estimate import FrameSize, MemoryEstimate, estimate_memory, fitting_settings
-from extrags.pipeline import STAGES, StageName
+from extrags.stages import StageName, stages_until
 from flows.cached_stages import CachedStages
 from flows.estimate import expected_seconds, without_kernels_in_words
 from flows.runners import NotInStoreError
@@ -62,7 +62,7 @@ def check_memory(
     found = MemoryEstimate(to_make)
     what = f"{name}: {size.frames} frames of {size.width} x {size.height} px take {found}"
     expected = expected_seconds(config, frames_work(counts, config))
-    ahead = set(STAGES[1 : STAGES.index(until) + 1]).difference(leave_out, made)
+    ahead = set(stages_until(until)[1:]).difference(leave_out, made)
     seconds = sum(sum(expected[stage].values()) for stage in ahead)
     log.info("%s, and about %s of processor time%s", what, duration_text(seconds), without_kernels_in_words())
     if limit_gb is None or found.peak_gb <= limit_gb:

@@ -12,7 +12,8 @@ from typing import Any, Literal
 
 from extrags.config import PipelineConfig
 from extrags.errors import ConfigError
-from extrags.pipeline import HELD_OUT_TRAINED_ON, NEED_GAUSSIANS, NO_GAUSSIANS
+from extrags.pipeline import HELD_OUT_TRAINED_ON, NO_GAUSSIANS
+from extrags.stages import REGISTRY, leading_to
 from flows.settings import pipeline_config
 
 __all__ = [
@@ -44,7 +45,11 @@ MethodName = Literal[
     "uc-nerf",
 ]
 
-EXPLORING = ("surface", "freespace", "explore", "enhance")
+EXPLORING: tuple[str, ...] = leading_to("enhance")
+"""Stages of methods that explore."""
+AFTER_COARSE: tuple[str, ...] = tuple(stage.name for stage in REGISTRY if stage.planned)
+"""Stages of methods that go on from the coarse scene."""
+ON_GAUSSIANS: tuple[str, ...] = tuple(stage.name for stage in REGISTRY if stage.needs_gaussians)
 
 PAPER_HAS_NO_PLAN = "the paper's pipeline runs every stage with its whole budget"
 
@@ -335,22 +340,22 @@ METHODS: dict[str, Method] = {
     ),
     "coarse": Method(
         "the light-aware coarse scene alone",
-        leave_out=dict.fromkeys([*EXPLORING, "finetune"], "the run measures the coarse scene"),
+        leave_out=dict.fromkeys(AFTER_COARSE, "the run measures the coarse scene"),
     ),
     "oracle": Method(
         "a ceiling, no method: the coarse scene of extrags made from held-out frames too",
         _oracle,
-        dict.fromkeys([*EXPLORING, "finetune"], "nothing may rest on a scene that has seen held-out frames"),
+        dict.fromkeys(AFTER_COARSE, "nothing may rest on a scene that has seen held-out frames"),
     ),
     "3dgs": Method(
         "plain 3D Gaussian Splatting: standard loss and schedule, SH 3, no light, no enhancement",
         _three_dgs_method,
-        dict.fromkeys([*EXPLORING, "finetune"], "plain 3DGS has no such stage"),
+        dict.fromkeys(AFTER_COARSE, "plain 3DGS has no such stage"),
     ),
     "gaussian-pancakes": Method(
         "Gaussian Pancakes: plain 3DGS held to depth and surface normals, densified early only",
         gaussian_pancakes,
-        dict.fromkeys([*EXPLORING, "finetune"], "Gaussian Pancakes has no such stage"),
+        dict.fromkeys(AFTER_COARSE, "Gaussian Pancakes has no such stage"),
     ),
     "classical": Method("as extrags, with the classical fill instead of the diffusion", _classical),
     "real-only": Method(
@@ -361,7 +366,7 @@ METHODS: dict[str, Method] = {
     "uc-nerf": Method(
         "UC-NeRF: radiance field conditioned on uncertainty-aware multi-view stereo",
         _uc_nerf,
-        dict.fromkeys(NEED_GAUSSIANS, NO_GAUSSIANS),
+        dict.fromkeys(ON_GAUSSIANS, NO_GAUSSIANS),
     ),
 }
 

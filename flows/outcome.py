@@ -6,50 +6,20 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from extrags.errors import ExtragsError
+from extrags.stages import REGISTRY, Part
 from extrags.store import Ref
 
 __all__ = [
     "NOT_COUNTED",
     "DatasetFailedError",
     "DatasetOutcome",
-    "Part",
     "SequenceFailedError",
     "SequenceOutcome",
     "StageRow",
     "StageState",
 ]
 
-Part = Literal[
-    "ingest",
-    "poses",
-    "depth",
-    "sequence",
-    "training",
-    "coarse",
-    "assess",
-    "plan",
-    "surface",
-    "freespace",
-    "waves",
-    "explore",
-    "restorer",
-    "enhance",
-    "judgement",
-    "finetune",
-    "renders_coarse",
-    "renders_final",
-    "renders_restored",
-    "metrics_coarse",
-    "metrics_final",
-    "metrics_restored",
-    "report",
-]
-"""Artefacts of a run. `sequence` has all frames with the latest poses, `depth` the estimated depth of the
-training frames, `training` the training frames alone, with that depth where it was estimated,
-`waves` the state of the exploration, `restorer` the restorer prepared for this scene, `judgement` how much of
-the fine-tuning is kept; what is `restored` are the final scene's held-out views, restored in the image."""
-
-NOT_COUNTED = frozenset({"evaluate", "report"})
+NOT_COUNTED = frozenset(stage.name for stage in REGISTRY if not stage.counted)
 """Stages that are not part of a method's run time."""
 
 StageState = Literal["ran", "cached", "skipped", "failed", "interrupted"]

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from extrags.stages import Part
 from extrags.store import Store
-from flows.outcome import NOT_COUNTED, Part, SequenceOutcome
+from flows.outcome import NOT_COUNTED, SequenceOutcome
 from flows.runners import Call, Runner
 from tasks.benchmark import benchmark_report
 from tasks.report import PAGE, dataset_report

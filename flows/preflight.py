@@ -7,7 +7,7 @@ from collections.abc import Collection
 
 from extrags.config import PipelineConfig
 from extrags.errors import WeightsError
-from extrags.pipeline import STAGES
+from extrags.stages import stages_until
 
 __all__ = ["preflight"]
 
@@ -34,11 +34,12 @@ def preflight(config: PipelineConfig, until: str, leave_out: Collection[str] = (
 
         native_isa()
     config = config.with_run_device()
-    if STAGES.index(until) >= STAGES.index("coarse"):
+    wanted = stages_until(until)
+    if "coarse" in wanted:
         from extrags.placement import check_device
 
         check_device(config)
-    if STAGES.index(until) >= STAGES.index("depth") and config.depth.enabled and "depth" not in leave_out:
+    if "depth" in wanted and config.depth.enabled and "depth" not in leave_out:
         from extrags.devices import chosen_device
         from tasks.weights import depth_completion_digest, depth_monocular_digest
 
@@ -50,7 +51,7 @@ def preflight(config: PipelineConfig, until: str, leave_out: Collection[str] = (
 
         config.check_imported()
         scene_digest(config.imported)
-    if STAGES.index(until) < STAGES.index("enhance"):
+    if "enhance" not in wanted:
         return
     # Here, because they load torch, which looking up a deployment must not.
     from tasks.weights import lpips_weights

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -51,7 +52,7 @@ def stage_preview(label: str, stage: str, made: Mapping[str, Ref], store: Store)
     Args:
         label: name of the sequence.
         stage: the stage that has ended.
-        made: what the sequence has, by the names of `flows.outcome.Part`.
+        made: what the sequence has, by the names of `extrags.stages.Part`.
         store: its artefacts.
 
     Returns:
@@ -61,23 +62,10 @@ def stage_preview(label: str, stage: str, made: Mapping[str, Ref], store: Store)
         ExtragsError: for an artefact that cannot be read.
         OSError: for a directory that cannot be written.
     """
-    strip: np.ndarray
-    if stage == "ingest":
-        strip, words = _recorded(made, store)
-    elif stage in ("coarse", "finetune"):
-        found = _rendered(made, store)
-        if found is None:
-            return None
-        strip, words = found
-    elif stage == "enhance":
-        strip, words = _restored(made, store)
-    elif stage == "evaluate":
-        found = _evaluated(made, store, FILE_TILE_PX)
-        if found is None:
-            return None
-        strip, words = found
-    else:
+    found = PICTURES[stage](made, store) if stage in PICTURES else None
+    if found is None:
         return None
+    strip, words = found
     from PIL import Image
 
     folder = store.state / "previews"
@@ -171,6 +159,16 @@ def _evaluated(refs: Mapping[Any, Ref], store: Store, tile_px: int) -> tuple[np.
     height = min(tile.shape[0] for tile in shown)
     strip = np.concatenate([tile[:height] for tile in shown], axis=1)
     return strip, f"held-out frame {frame}: {', '.join(words)}"
+
+
+PICTURES: dict[str, Callable[[Mapping[str, Ref], Store], tuple[np.ndarray, str] | None]] = {
+    "ingest": _recorded,
+    "coarse": _rendered,
+    "enhance": _restored,
+    "finetune": _rendered,
+    "evaluate": partial(_evaluated, tile_px=FILE_TILE_PX),
+}
+"""By stage: a picture of what it has made, with words; others make nothing to be looked at."""
 
 
 def _array(values: Any) -> np.ndarray:

@@ -20,7 +20,7 @@ from rich.table import Table
 from rich.text import Text
 
 from extrags.config import profile_config
-from extrags.pipeline import STAGES, StageName
+from extrags.stages import StageName, stages_until
 from extrags.store import Store
 from flows.estimate import RunEstimate, expected_seconds
 from flows.previews import stage_preview
@@ -204,7 +204,7 @@ class RunDisplay:
         """`phantom/11@sparse  ✓ ingest  - poses  ▸ coarse  · assess`, with breaks between stages alone."""
         estimate = self._estimate.in_work[label]
         words, used = Text.assemble((label, "bold")), len(label)
-        for stage in STAGES[: STAGES.index(self._run.until) + 1]:
+        for stage in stages_until(self._run.until):
             ended = estimate.ended.get(stage)
             if ended is not None:
                 mark, style = MARKS[ended.state], STYLES[ended.state]

@@ -82,7 +82,7 @@ class RecordedRun:
         }
 
     def ref(self, store: Store, part: str) -> Ref | None:
-        """An artefact that the page shows, by the names of `flows.outcome.Part`; None where it shows none.
+        """An artefact that the page shows, by the names of `extrags.stages.Part`; None where it shows none.
 
         Raises:
             StoreError: when it is gone from the store.

@@ -8,10 +8,7 @@ from typing import Any
 
 from extrags.config import PipelineConfig
 from extrags.errors import StoreError
-from extrags.pipeline import STAGES
 from extrags.run_costs import (
-    RENDERING,
-    STAGE_TASKS,
     CostModel,
     TaskCost,
     Workload,
@@ -22,6 +19,7 @@ from extrags.run_costs import (
     stage_tasks,
 )
 from extrags.scene_plan import ScenePlan
+from extrags.stages import REGISTRY, STAGES, cost_of, modelled_tasks
 from extrags.store import Manifest, Store
 from flows.outcome import SequenceOutcome
 from flows.workloads import frames_work, task_repeats
@@ -40,6 +38,8 @@ __all__ = [
 Record = tuple[Workload, TaskCost]
 OF_RESTORER = ("backend", "fold_iterations", "folds", "judge", "samples", "steps", "train_iterations")
 """Settings that the restorer is prepared with, and that its runs depend on."""
+COST_SETTINGS = tuple(stage.name for stage in REGISTRY if stage.costs_by_settings)
+"""Groups of settings that costs depend on."""
 ENOUGH_SECONDS = 10.0
 """So much work on record tells more of a machine than a probe."""
 
@@ -145,7 +145,7 @@ def pace_here(store: Store, fallback: PipelineConfig, model: CostModel) -> Pace:
     if rasteriser == "native":
         return Pace("probe", len(processor), dict.fromkeys(fitted, factor), {})
     # How much slower another rasteriser is tells nothing of what does not render.
-    factors = {task: factor if task in RENDERING else 1.0 for task in fitted}
+    factors = {task: factor if cost_of(task).renders else 1.0 for task in fitted}
     return Pace(f"probe of {rasteriser}", len(processor), factors, {})
 
 
@@ -187,7 +187,7 @@ def predict_run(
     for stage in STAGES:
         if stage not in stages:
             continue
-        if not any(task in model.time for task in STAGE_TASKS[stage]):
+        if not any(task in model.time for task in modelled_tasks(stage)):
             unknown.append(stage)
             continue
         repeats = task_repeats(stage, measured_scenes, restored)
@@ -268,7 +268,7 @@ def recorded_costs(store: Store, fallback: PipelineConfig) -> tuple[list[Record]
 
     manifests = {manifest.key: manifest for manifest in store.ls()}
     versions = all_stage_versions()
-    modelled = {task for tasks in STAGE_TASKS.values() for task in tasks}
+    modelled = {task for stage in STAGES for task in modelled_tasks(stage)}
     elapsed, processor = [], []
     for manifest in manifests.values():
         if manifest.stage not in modelled or versions.get(manifest.stage) != manifest.version:
@@ -289,15 +289,13 @@ def recorded_costs(store: Store, fallback: PipelineConfig) -> tuple[list[Record]
 
 def _parts(manifest: Manifest, manifests: Mapping[str, Manifest]) -> list[Manifest]:
     """What belongs to the same work: the waves before an exploration's end, the batches of a restoration."""
-    wanted = {"explore": "explore-", "enhance": "enhance-restore"}.get(manifest.stage)
-    if wanted is None:
-        return []
+    wanted = cost_of(manifest.stage).includes
     found: dict[str, Manifest] = {}
     open_ = [manifest]
     while open_:
         for key in open_.pop().input_keys.values():
             part = manifests.get(key)
-            if part is not None and key not in found and part.stage.startswith(wanted):
+            if part is not None and key not in found and part.stage in wanted:
                 found[key] = part
                 open_.append(part)
     return list(found.values())
@@ -355,7 +353,7 @@ def _config(line: list[Manifest], fallback: PipelineConfig) -> PipelineConfig:
     for item in line:
         own = item.stage.partition("-")[0]
         groups = {**item.config, own: item.config.get("config")}
-        for group in ("coarse", "explore", "enhance", "finetune"):
+        for group in COST_SETTINGS:
             settings = groups.get(group)
             if isinstance(settings, dict) and group not in changed:
                 known = type(getattr(fallback, group)).model_fields

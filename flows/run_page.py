@@ -11,8 +11,8 @@ from pathlib import Path
 from prefect.artifacts import create_image_artifact, create_link_artifact
 
 from extrags.config import PipelineConfig
-from extrags.pipeline import StageName
 from extrags.run_costs import Workload
+from extrags.stages import StageName
 from extrags.store import Store
 from flows.estimate import RunEstimate, expected_seconds
 from flows.outcome import SequenceOutcome

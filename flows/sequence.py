@@ -11,7 +11,7 @@ from pydantic import Field
 
 from data_catalog.names import plain_name
 from extrags.config import ProfileName, Seed
-from extrags.pipeline import StageName
+from extrags.stages import StageName
 from extrags.store import Store
 from extrags.store.runs import file_killed
 from flows.cases import SequenceCase, record_outcome_quietly

@@ -11,7 +11,7 @@ from data_catalog.names import comparable_name
 from data_catalog.patterns import is_named
 from extrags.errors import ExtragsError, UnknownSequenceError
 from extrags.metrics.comparison import figure_of
-from extrags.pipeline import STAGES
+from extrags.stages import STAGES, all_tasks, stage_of_task, stages_until
 from extrags.store import Manifest, Store, in_work
 from extrags.store.manifest import stage_of
 from extrags.store.runs import Run, active_runs, runs_of
@@ -22,23 +22,11 @@ __all__ = ["StageStatus", "StatusRow", "StoreStatus", "store_status"]
 
 State = Literal["done", "skipped", "failed", "missing", "running", "stopped"]
 
-TASKS = {
-    "training-frames": "coarse",
-    "depth-frames": "coarse",
-    "refined-frames": "coarse",
-    "continued-coarse": "coarse",
-    "import-scene": "coarse",
-    "plan": "assess",
-    "uc-nerf": "coarse",
-    "uc-nerf-render": "evaluate",
-}
-"""Stages of the tasks that do not begin with the name of theirs."""
-
-SCENES = frozenset({"continued-coarse", "import-scene", "uc-nerf"})
-"""Tasks that make what the stage `coarse` otherwise makes."""
+SCENES = frozenset(task.name for task in all_tasks() if task.in_place)
+"""Tasks that make what the task of the stage's name otherwise makes."""
 OTHER_SETTINGS = "other settings"
 """Variant of what is being run with settings that no run on record has."""
-FRAMES = frozenset({"training-frames", "depth-frames", "refined-frames"})
+FRAMES = frozenset(task.name for task in all_tasks() if task.shared)
 """Tasks that several stages have run: they do not tell how far a run has come."""
 
 
@@ -337,7 +325,7 @@ def _row(record: OutcomeRecord, there: set[str], running: set[str]) -> StatusRow
     stages = {}
     for row in record["stages"]:
         stages[row["stage"]] = _stage(row, there, running)
-    for name in STAGES[: STAGES.index(record["until"]) + 1]:
+    for name in stages_until(record["until"]):
         stages.setdefault(name, StageStatus("running" if name in running else "missing"))
     states = {stage.state for stage in stages.values()}
     state: State = "done"
@@ -420,7 +408,9 @@ def _variant(record: OutcomeRecord) -> str:
 
 
 def _stage_of(task: str) -> str:
-    """The stage that a task belongs to: `enhance-restore` to `enhance`."""
-    return TASKS.get(task) or next(
-        (stage for stage in STAGES if task == stage or task.startswith(f"{stage}-")), task
-    )
+    """The stage that a task belongs to: `enhance-restore` to `enhance`; else the task itself."""
+    stage = stage_of_task(task)
+    if stage is not None:
+        return stage.name
+    # Programs of other versions share the store, and their tasks begin with the names of their stages.
+    return next((name for name in STAGES if task.startswith(f"{name}-")), task)

@@ -9,13 +9,14 @@ from data_catalog.catalog import resolve, source_fingerprint
 from extrags.config import PipelineConfig
 from extrags.errors import DamagedArtefactError
 from extrags.metrics.registry import added_metrics
-from extrags.pipeline import HELD_OUT_TRAINED_ON, StageName
+from extrags.pipeline import HELD_OUT_TRAINED_ON
+from extrags.stages import Part, StageName
 from extrags.store import Ref
 from flows.cached_stages import CachedStages
 from flows.continuation import coarse_call
 from flows.imported import imported_call, of_imported_scene
 from flows.memory_limit import check_memory, made_stages
-from flows.outcome import Part, SequenceOutcome, StageRow
+from flows.outcome import SequenceOutcome, StageRow
 from flows.runners import Call, Runner, StoreRunner
 from tasks.assess import assess, measuring_settings, plan, planning_settings
 from tasks.coarse import coarse, refined_frames

@@ -9,8 +9,8 @@ from typing import Any
 from data_catalog import Descriptor, Glance, describe, glance
 from extrags.config import PipelineConfig
 from extrags.errors import ExtragsError
-from extrags.pipeline import STAGES
-from extrags.run_costs import STAGE_TASKS, Workload
+from extrags.run_costs import Workload
+from extrags.stages import STAGES, Repeats, modelled_tasks
 
 __all__ = [
     "at_detail_size",
@@ -154,13 +154,17 @@ def read_size(about: Descriptor, config: PipelineConfig) -> tuple[float, float]:
 
 
 def task_repeats(stage: str, measured_scenes: int, restored: int) -> dict[str, int]:
-    """How often each task of a stage runs; those that do not run are left out."""
-    if stage != "evaluate":
-        return dict.fromkeys(STAGE_TASKS[stage], 1)
-    found = {
-        "evaluate-render": measured_scenes,
-        "evaluate-restore": restored,
-        "evaluate-views": 1,
-        "evaluate": measured_scenes + restored,
+    """How often each task of a stage runs; those that do not run are left out.
+
+    Args:
+        stage: name.
+        measured_scenes: scenes that are evaluated.
+        restored: sets of restored views that are evaluated beside them, 0 or 1.
+    """
+    times: dict[Repeats, int] = {
+        "once": 1,
+        "scenes": measured_scenes,
+        "restored": restored,
+        "measured": measured_scenes + restored,
     }
-    return {task: found[task] for task in STAGE_TASKS[stage] if found[task]}
+    return {task: times[cost.repeats] for task, cost in modelled_tasks(stage).items() if times[cost.repeats]}

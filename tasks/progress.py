@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 
 from extrags.errors import ExtragsError
 from extrags.events import Event, MetricRecorded, Progress, subscribed
+from extrags.stages import all_tasks
 from extrags.store import Ref
 
 __all__ = [
@@ -36,7 +37,7 @@ log = logging.getLogger("extrags.progress")
 LOG_EVERY_SECONDS = 30.0
 """Between two lines of the log on how far a sequence is."""
 
-IN_PARALLEL = frozenset({"explore-branch", "enhance-restore"})
+IN_PARALLEL = frozenset(task.name for task in all_tasks() if task.in_parallel)
 """Tasks of which several run at once: the count of one says nothing about the stage (`of_tasks` does)."""
 
 
@@ -55,7 +56,7 @@ class StageProgress:
     """Loss, count or reason, ready to be shown."""
     seconds: float = 0.0
     made: Mapping[str, Ref] = field(default_factory=dict)
-    """When the stage has ended: what the sequence has, by the names of `flows.outcome.Part`."""
+    """When the stage has ended: what the sequence has, by the names of `extrags.stages.Part`."""
     expected: Mapping[str, Mapping[str, float]] | None = None
     """Seconds of the tasks of each stage, where the stage that has ended told more of them: the size of the
     frames, or the budgets of the plan."""

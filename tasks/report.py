@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import platform
 from dataclasses import replace
-from typing import Any, Literal, TypeVar, get_args
+from typing import Any, TypeVar
 
 from extrags.config import PipelineConfig
 from extrags.redaction import without_credentials
+from extrags.stages import REGISTRY, Part, StageName
 from extrags.store import Ref, Slot, Storable, digest_of
 from extrags.store.slot import Artefacts
 from tasks.coarse import HISTORY
@@ -25,25 +26,8 @@ ROWS = "stages.json"
 S = TypeVar("S", bound=Storable)
 
 
-ReportPart = Literal[
-    "sequence",
-    "depth",
-    "coarse",
-    "plan",
-    "surface",
-    "freespace",
-    "explore",
-    "enhance",
-    "finetune",
-    "renders_coarse",
-    "renders_final",
-    "renders_restored",
-    "metrics_coarse",
-    "metrics_final",
-    "metrics_restored",
-]
-REPORT_PARTS: tuple[ReportPart, ...] = get_args(ReportPart)
-"""What a page shows of a run, by the names of `flows.outcome.Part`; all but `sequence` may be missing."""
+REPORT_PARTS: tuple[Part, ...] = tuple(part for stage in REGISTRY for part in stage.page_parts)
+"""What a page shows of a run, in the order of the stages; all but `sequence` may be missing."""
 
 
 # `rows` holds the times of the stages in this run. The page shows them, but they are not part of its cache
@@ -146,7 +130,7 @@ def _environment(store: Artefacts, parts: dict[str, Ref]) -> dict[str, str]:
 
 def _absent(skipped: dict[str, str]) -> dict[str, str]:
     """Parts of the page that a skipped stage would have made."""
-    made_by = {
+    made_by: dict[str, StageName] = {
         "mesh": "surface",
         "grid": "freespace",
         "trajectories": "explore",

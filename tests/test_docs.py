@@ -90,7 +90,7 @@ def test_links_and_anchors_resolve(page: Path) -> None:
 
 
 def test_every_stage_has_a_page() -> None:
-    from extrags.pipeline import STAGES
+    from extrags.stages import STAGES
 
     rows = re.findall(
         r"^\| ([a-z, ]+) \| .*\]\((\S+?)(?:#\S*)?\)", (REPOSITORY / "docs/index.md").read_text(), re.MULTILINE

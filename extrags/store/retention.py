@@ -14,6 +14,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
+from extrags.stages import PAGES_OF_SEVERAL, all_tasks
 from extrags.store.artefacts import Store
 from extrags.store.manifest import Manifest, stage_of
 from extrags.store.runs import Run, active_runs, forget, runs_of
@@ -25,10 +26,10 @@ log = logging.getLogger(__name__)
 MOMENT_S = 600.0
 """What was made or used within it is kept: a run may have it in hand, and not have recorded it yet."""
 
-FINAL_STAGES = frozenset({"report", "dataset-report", "benchmark-report"})
+FINAL_STAGES = frozenset({"report", *PAGES_OF_SEVERAL})
 """Where a run has no record, its page stands for it, with what that was made from."""
 
-INTERMEDIATE_STAGES = frozenset({"evaluate-views"})
+INTERMEDIATE_STAGES = frozenset(task.name for task in all_tasks() if task.intermediate)
 """Figures of the views of several scenes, from which the metrics of each are taken. They stay with the
 metrics, which other runs may share, but do not keep the other scenes."""
 

@@ -20,7 +20,7 @@ from extrags.redaction import CredentialFilter, without_credentials
 if TYPE_CHECKING:
     from extrags.config import PipelineConfig
     from extrags.config.base import StageConfig
-    from extrags.pipeline import StageName
+    from extrags.stages import StageName
     from flows.limits import StageLimits
     from flows.outcome_records import OutcomeRecord
     from flows.wiring import SequenceRun

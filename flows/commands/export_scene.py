@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from extrags.config import PipelineConfig
     from extrags.export import CameraPath
     from extrags.gaussians import Gaussians
-    from extrags.pipeline import StageName
     from extrags.scene import Scene
     from extrags.sequence import EndoscopicSequence
+    from extrags.stages import StageName
     from flows.wiring import SequenceRun
 
 __all__ = ["ALONG", "export_scene", "posed_sequence"]

@@ -222,7 +222,7 @@ def add_runner(parser: Parser) -> None:
 
 def add_stages(parser: Parser) -> None:
     """`--until` and `--refresh`."""
-    from extrags.pipeline import STAGES
+    from extrags.stages import STAGES
 
     parser.add_argument(
         "--until", choices=STAGES, default="report", metavar="STAGE", help="stop after this stage"

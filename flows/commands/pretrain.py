@@ -32,6 +32,22 @@ def add_arguments(parser: Parser) -> None:
     )
     parser.set_defaults(command=pretrain)
     add_output(parser, "FOLDER", help="where the weights go; needed unless only scenes are made")
+    _add_scenes(parser)
+    _add_training(parser)
+    _add_networks(parser)
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="any setting of the training, such as most_seconds=1200, or of a restorer's device=cuda, "
+        "drawing_processes=14 or drawn_share=0.8; repeatable. A wrong name lists all of them. A restorer's "
+        "training that was ended goes on from the checkpoint in its folder",
+    )
+
+
+def _add_scenes(parser: Parser) -> None:
+    """Where scenes come from, and how they are made."""
     parser.add_argument(
         "--scenes-folder",
         default=".extrags/pretraining",
@@ -83,6 +99,10 @@ def add_arguments(parser: Parser) -> None:
         "(from 0 to 1; default: %(default)s)",
     )
     parser.add_argument("--scenes-only", action="store_true", help="make the scenes, and train nothing")
+
+
+def _add_training(parser: Parser) -> None:
+    """How much is trained, from what, and with which weights of the loss."""
     parser.add_argument(
         "--scenes",
         type=int,
@@ -114,6 +134,10 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument(
         "--workers", type=int, default=1, metavar="N", help="scenes made at once (default: %(default)s)"
     )
+
+
+def _add_networks(parser: Parser) -> None:
+    """What is trained: a restorer and by which loss, or another network."""
     parser.add_argument(
         "--without-perceptual",
         action="store_true",
@@ -139,15 +163,6 @@ def add_arguments(parser: Parser) -> None:
         help="train the network that reads the depth of what a restored view has invented; the scenes are "
         "explored, and --start names the restorer of their virtual views (default: bundled). It keeps no "
         "checkpoint",
-    )
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        help="any setting of the training, such as most_seconds=1200, or of a restorer's device=cuda, "
-        "drawing_processes=14 or drawn_share=0.8; repeatable. A wrong name lists all of them. A restorer's "
-        "training that was ended goes on from the checkpoint in its folder",
     )
 
 

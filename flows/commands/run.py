@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import logging
 import re
 import sys
 import time
@@ -16,9 +15,6 @@ from typing import TYPE_CHECKING, Any, Literal
 from extrags.errors import (
     ConfigError,
     DamagedArtefactError,
-    ExtragsError,
-    SourceError,
-    UnknownSequenceError,
 )
 from flows.commands.common import (
     items,
@@ -30,16 +26,15 @@ from flows.commands.common import (
     write_json,
 )
 from flows.commands.options import Parser, add_json, add_method, add_runner, add_sequences, add_stages
+from flows.commands.run_checks import check_methods, check_names, check_working_distance, wrong_source
 from flows.failures import describe_error
-from flows.outcome import DatasetFailedError, DatasetOutcome, SequenceOutcome, StageRow
+from flows.outcome import DatasetFailedError, DatasetOutcome, SequenceOutcome
 
 if TYPE_CHECKING:
-    from extrags.pipeline import StageName
+    from extrags.stages import StageName
     from flows.cases import SequenceCase
 
 __all__ = ["Several", "add_arguments", "execute", "parsed_matrix", "parsed_methods", "run"]
-
-log = logging.getLogger(__name__)
 
 
 def add_arguments(parser: Parser) -> None:
@@ -214,11 +209,10 @@ def execute(
         MissingDependencyError: when a package that the settings need is not there.
     """
     from extrags.store import Store
-    from flows.environment import has_own_home, prepare, without_heartbeat
-    from flows.temporary_server import start_early, stop_early, temporary_server
+    from flows.environment import has_own_home, prepare
+    from flows.temporary_server import start_early, stop_early
 
-    terminal = sys.stderr.isatty()
-    set_up_logging(debug=given.debug, terminal=terminal, quiet=given.quiet)
+    set_up_logging(debug=given.debug, terminal=sys.stderr.isatty(), quiet=given.quiet)
     root = store_root(given)
     several = several or Several(methods=(given.method,), seeds=(given.seed,))
     if several.methods == (given.method,):
@@ -229,63 +223,26 @@ def execute(
     always = refresh or always_flow
     if own_home and (always or not all(_may_be_finished(root, name, until) for name in sequences)):
         start_early()
-    from flows.cases import cases_of, selected
-    from flows.expectation import expectations, expected_words
-    from flows.methods import METHODS
-    from flows.selection import absolute_manifests, chosen_sequences
-
-    chosen = chosen_sequences(sequences)
-    _check_names([item.name for item in chosen])
-    every = cases_of(
-        chosen,
-        methods=several.methods,
-        profile=given.profile,
-        seeds=several.seeds,
-        settings=given.settings,
-        matrix=several.matrix,
-    )
-    cases = selected(every, several.only, root, until)
-    if not cases:
-        stop_early()
-        return DatasetOutcome([])
+    cases = _cases(sequences, given, several, root, until)
     try:
-        _check_working_distance(cases)
+        found = _without_flow(cases, root, until, always=always, several_seeds=len(several.seeds) > 1)
     except ConfigError:
         stop_early()
         raise
-    if not always:
-        # Nothing to make: no need to wait for a server.
-        found = _from_store(cases, root, until, several_seeds=len(several.seeds) > 1)
-        if found is not None:
-            stop_early()
-            return found
+    if found is not None:
+        stop_early()
+        return found
     # The flow looks as well; here it is said without waiting for a server, which writes into the store.
     Store(root).check_writable()
     if own_home:
         start_early()
-    if len(cases) == 1:
-        refused = _wrong_source(cases[0], until)
-        if refused is not None:
-            stop_early()
-            _record(cases[0], refused, root, until)
-            return _raised(DatasetOutcome([refused]), given)
-    from flows.preflight import preflight
-
-    for method in several.methods:
-        first = next((case for case in cases if case.method == method), None)
-        if first is not None:
-            preflight(first.config(), until, METHODS[method].leave_out)
-    if terminal and not given.quiet and len(cases) > 1:
-        # Elsewhere it is a line of the log.
-        expected = expectations(cases, root, until, refresh=refresh)
-        print(
-            f"extrags: {expected_words(expected, at_once, processes=given.runner != 'threads')}",
-            file=sys.stderr,
-        )
-    from flows.dataset import reconstruct_dataset
-    from flows.estimate import expected_seconds
-    from flows.progress_display import RunInView, progress_display
-    from flows.workloads import expected_work
+    refused = wrong_source(cases[0], until) if len(cases) == 1 else None
+    if refused is not None:
+        stop_early()
+        _record(cases[0], refused, root, until)
+        return _raised(DatasetOutcome([refused]), given)
+    check_methods(cases, several.methods, until)
+    from flows.selection import absolute_manifests
 
     # Names were checked by the parser; flows have literals for them.
     arguments: dict[str, Any] = {
@@ -305,16 +262,87 @@ def execute(
         "only": several.only,
         "limits": stage_limits(given),
     }
-    first_config = cases[0].config()
-    expected_of = expected_seconds(first_config, expected_work(cases[0].sequence, first_config))
-    view = RunInView(len(cases), expected_of, until, root)
+    return _raised(_in_a_flow(cases, given, arguments), given)
+
+
+def _cases(
+    sequences: list[str], given: argparse.Namespace, several: Several, root: str, until: StageName
+) -> list[SequenceCase]:
+    """What is to be run: every combination of sequences and of what makes several runs of one.
+
+    Raises:
+        ConfigError: for wrong settings or manifests.
+        UnknownSequenceError: for a name that is not in the catalogue, or a pattern that matches none.
+        StoreError: when the store cannot be read.
+    """
+    from flows.cases import cases_of, selected
+    from flows.selection import chosen_sequences
+
+    chosen = chosen_sequences(sequences)
+    check_names([item.name for item in chosen])
+    every = cases_of(
+        chosen,
+        methods=several.methods,
+        profile=given.profile,
+        seeds=several.seeds,
+        settings=given.settings,
+        matrix=several.matrix,
+    )
+    return selected(every, several.only, root, until)
+
+
+def _without_flow(
+    cases: Sequence[SequenceCase], root: str, until: StageName, *, always: bool, several_seeds: bool
+) -> DatasetOutcome | None:
+    """The outcome where there is nothing to make, so that nobody waits for a server; None where there is.
+
+    Raises:
+        ConfigError: see `check_working_distance`.
+    """
+    if not cases:
+        return DatasetOutcome([])
+    check_working_distance(cases)
+    return None if always else _from_store(cases, root, until, several_seeds=several_seeds)
+
+
+def _in_a_flow(
+    cases: Sequence[SequenceCase], given: argparse.Namespace, arguments: dict[str, Any]
+) -> DatasetOutcome:
+    """Run the cases in a flow run, and show how far it is.
+
+    Args:
+        cases: what the flow will run.
+        given: the command line.
+        arguments: of `flows.dataset.reconstruct_dataset`.
+    """
+    from flows.environment import without_heartbeat
+    from flows.expectation import expectations, expected_words
+
+    root, until, at_once = arguments["store"], arguments["until"], arguments["at_once"]
+    if sys.stderr.isatty() and not given.quiet and len(cases) > 1:
+        # Elsewhere it is a line of the log.
+        expected = expectations(cases, root, until, refresh=arguments["refresh"])
+        print(
+            f"extrags: {expected_words(expected, at_once, processes=given.runner != 'threads')}",
+            file=sys.stderr,
+        )
+    from flows.dataset import reconstruct_dataset
+    from flows.estimate import expected_seconds
+    from flows.progress_display import RunInView, progress_display
+    from flows.temporary_server import temporary_server
+    from flows.workloads import expected_work
+
+    config = cases[0].config()
+    view = RunInView(
+        len(cases), expected_seconds(config, expected_work(cases[0].sequence, config)), until, root
+    )
     with temporary_server(), without_heartbeat(), progress_display(showing(given), view):
         try:
             outcome: DatasetOutcome = reconstruct_dataset(**arguments)
         except DatasetFailedError as error:
             # Said to Prefect; here each sequence is reported, and the exit code is 1 if any failed.
             outcome = error.outcome
-    return _raised(outcome, given)
+    return outcome
 
 
 def _raised(outcome: DatasetOutcome, given: argparse.Namespace) -> DatasetOutcome:
@@ -324,58 +352,6 @@ def _raised(outcome: DatasetOutcome, given: argparse.Namespace) -> DatasetOutcom
             if sequence.error is not None:
                 raise sequence.error
     return outcome
-
-
-def _check_working_distance(cases: Sequence[SequenceCase]) -> None:
-    """Refuse `poses.working_distance_mm` where no poses are estimated, and warn where some are not.
-
-    Only the poses stage looks at it, which sources with poses of their own skip.
-
-    Raises:
-        ConfigError: every sequence that it is given for has poses.
-    """
-    from data_catalog import describe, glance
-
-    given, posed = set(), []
-    for case in cases:
-        config = case.config()
-        if config.poses.working_distance_mm is None or config.poses.replace_given or case.sequence in given:
-            continue
-        given.add(case.sequence)
-        try:
-            about = glance(case.sequence, config.ingest) or describe(case.sequence)
-        except (ConfigError, SourceError, UnknownSequenceError):
-            # What is wrong with a source is said by the run, for each by itself.
-            continue
-        if about.has_poses:
-            posed.append(case.sequence)
-    if not posed:
-        return
-    first = posed[0] if len(posed) == 1 else f"{posed[0]} and {len(posed) - 1} more"
-    problem = (
-        f"{first}: poses.working_distance_mm makes estimated poses metric, and these are the source's own; "
-        "ingest.scale_mm_per_unit (--scale) says what their unit is where it is arbitrary, and "
-        "poses.replace_given estimates others in their place"
-    )
-    if len(posed) == len(given):
-        raise ConfigError(problem)
-    log.warning("%s", problem)
-
-
-def _wrong_source(case: SequenceCase, until: StageName) -> SequenceOutcome | None:
-    """How a run would fail whose source can be seen to be wrong without reading pictures; else None."""
-    from data_catalog import glance
-    from data_catalog.names import plain_name
-    from extrags.pipeline import STAGES
-
-    try:
-        glance(case.sequence, case.config().ingest)
-    except SourceError as error:
-        rest = STAGES[1 : STAGES.index(until) + 1]
-        rows = [StageRow("ingest", "failed", reason=str(error))]
-        rows += [StageRow(stage, "skipped", reason="ingest failed") for stage in rest]
-        return SequenceOutcome(plain_name(case.sequence), "failed", rows, error=error)
-    return None
 
 
 def _may_be_finished(root: str, sequence: str, until: StageName) -> bool:
@@ -453,16 +429,3 @@ def _record(case: SequenceCase, outcome: SequenceOutcome, root: str, until: Stag
         if used is not None:
             used.add(key for row in outcome.stages for key in row.made)
     record_outcome_quietly(store, case, outcome, until, case.config())
-
-
-def _check_names(sequences: list[str]) -> None:
-    """An unknown name is wrong usage and stops everything; a source that is wrong concerns its own run."""
-    from data_catalog.catalog import resolve
-
-    for sequence in sequences:
-        try:
-            resolve(sequence)
-        except UnknownSequenceError:
-            raise
-        except ExtragsError:
-            continue

@@ -74,8 +74,8 @@ def _print(found: StoreStatus) -> None:
     from rich.measure import Measurement
     from rich.table import Table
 
-    from extrags.pipeline import STAGES
     from extrags.report.wording import duration
+    from extrags.stages import STAGES
     from flows.terminal import console
 
     out = console()

@@ -23,10 +23,9 @@ from itertools import pairwise
 from typing import Any
 
 from extrags.store import Manifest, Store
+from tasks.progress import IN_PARALLEL
 
 WORKERS = (1, 2, 4, 8, 16, 32, 64)
-SIDE_BY_SIDE = frozenset({"explore-branch", "enhance-restore"})
-"""Tasks of which a sequence has several that wait for nothing but what was before all of them."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +98,7 @@ def sequence_tasks(times: dict[str, Line], frames: int) -> list[Task]:
     """The chain of tasks of a sequence; those that run side by side are one entry."""
     return [
         Task(name, line.seconds(frames), max(1, round(line.width)))
-        if name in SIDE_BY_SIDE
+        if name in IN_PARALLEL
         else Task(name, line.seconds(frames) * max(1.0, line.width))
         for name, line in times.items()
     ]

@@ -19,9 +19,10 @@ from extrags.config import (
     PipelineConfig,
 )
 from extrags.errors import CaptureError, ConfigError
-from extrags.run_costs import STAGE_TASKS, Workload, packaged_model
+from extrags.run_costs import Workload, packaged_model
 from extrags.scene import Scene
 from extrags.scene_plan import ScenePlan, decide
+from extrags.stages import modelled_tasks
 
 from .exploration.tube import Tube, make_ball, make_tube, small_tube
 
@@ -83,7 +84,7 @@ class TestAssess:
         work = Workload(pixels, frames, frames, 0, settings, width=sequence.width, coarse_gaussians=gaussians)
         model = packaged_model()
         for line in plan.decisions:
-            tasks = ("finetune-judge",) if line.stage == "finetune" else STAGE_TASKS[line.stage]
+            tasks = ("finetune-judge",) if line.stage == "finetune" else modelled_tasks(line.stage)
             whole = sum(model.predict(task, work).seconds for task in tasks)
             assert line.saves_s == pytest.approx(whole, abs=0.051)
             assert line.saves_s > 0

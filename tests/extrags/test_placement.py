@@ -11,8 +11,8 @@ from extrags import placement
 from extrags.config import PipelineConfig
 from extrags.errors import ConfigError, MissingDependencyError
 from extrags.in_memory_pipeline import InMemoryPipeline
-from extrags.pipeline import STAGES
 from extrags.placement import Placement, check_device, placements, run_device
+from extrags.stages import STAGES
 from extrags.store import canonical
 from tests.extrags.lit_tube import Tube
 

@@ -11,7 +11,6 @@ import pytest
 from extrags.config import PipelineConfig, profile_config
 from extrags.errors import ConfigError
 from extrags.run_costs import (
-    STAGE_TASKS,
     CostModel,
     TaskCost,
     Workload,
@@ -23,6 +22,7 @@ from extrags.run_costs import (
     stage_seconds,
     stage_tasks,
 )
+from extrags.stages import STAGES, modelled_tasks
 
 
 def work(
@@ -210,7 +210,7 @@ class TestRestorer:
     )
     def test_what_no_record_tells_of(self, settings: dict[str, object], tasks: set[str]) -> None:
         config = profile_config("quick").with_overrides(settings)
-        every = {task for found in STAGE_TASKS.values() for task in found}
+        every = {task for stage in STAGES for task in modelled_tasks(stage)}
         assert {task for task in every if beyond_the_fit(task, config)} == tasks
 
     def test_tasks_that_do_not_run_cost_nothing(self) -> None:
@@ -280,7 +280,7 @@ class TestPackaged:
         assert 2 * alone < together < 2.6 * alone
 
     def test_knows_the_tasks_of_the_stages(self) -> None:
-        known = {task for tasks in STAGE_TASKS.values() for task in tasks}
+        known = {task for stage in STAGES for task in modelled_tasks(stage)}
         assert set(packaged_model().time) <= known
         assert set(packaged_model().memory) == set(packaged_model().time)
 

@@ -16,6 +16,7 @@ from extrags.config import PipelineConfig
 from extrags.finetuning_judge import Judgement
 from extrags.scene_plan import ScenePlan, decide
 from extrags.store import Manifest, Ref, digest_of
+from flows.outcome import SequenceOutcome
 from flows.runners import Call, Result
 from flows.wiring import SequenceRun
 from tasks.evaluate import METRICS_FILE
@@ -121,7 +122,7 @@ def recorded_keys(
 
 def recorded_run(
     name: str, config: PipelineConfig, recorded: RecordedRun, leave_out: Mapping[str, str] | None = None
-) -> None:
+) -> SequenceOutcome:
     """Go through all stages of a sequence; the arguments are those of `recorded_keys`.
 
     Raises:
@@ -134,3 +135,4 @@ def recorded_run(
         outcome = run.run()
     if outcome.error is not None:
         raise outcome.error
+    return outcome

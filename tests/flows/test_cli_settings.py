@@ -11,7 +11,7 @@ from PIL import Image
 from extrags.errors import ConfigError
 from flows.cases import SequenceCase
 from flows.cli import main, parser
-from flows.commands.run import _check_working_distance
+from flows.commands.run_checks import check_working_distance
 from tests.flows.tiny import SEQUENCE
 
 pytestmark = pytest.mark.usefixtures("untouched_environment")
@@ -53,17 +53,17 @@ class TestSettingsOfOtherSources:
 
     def test_a_distance_for_poses_that_are_estimated(self, frames: str) -> None:
         again = {**DISTANCE, "poses.replace_given": True}
-        _check_working_distance([SequenceCase(frames, settings=DISTANCE)])
-        _check_working_distance([SequenceCase(SEQUENCE, settings=again), SequenceCase(SEQUENCE)])
+        check_working_distance([SequenceCase(frames, settings=DISTANCE)])
+        check_working_distance([SequenceCase(SEQUENCE, settings=again), SequenceCase(SEQUENCE)])
 
     def test_a_distance_for_some(self, frames: str, caplog: pytest.LogCaptureFixture) -> None:
         cases = [SequenceCase(name, settings=DISTANCE) for name in (frames, SEQUENCE, "phantom/1@sparse")]
         with caplog.at_level(logging.WARNING):
-            _check_working_distance(cases)
+            check_working_distance(cases)
         (said,) = caplog.messages
         assert said.startswith(f"{SEQUENCE} and 1 more: poses.working_distance_mm makes estimated poses")
         with pytest.raises(ConfigError, match=r"and 1 more: poses\.working_distance_mm"):
-            _check_working_distance(cases[1:])
+            check_working_distance(cases[1:])
 
 
 class TestRunners:

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from extrags.errors import ConfigError
-from extrags.pipeline import STAGES
+from extrags.stages import STAGES
 from flows.cli import main
 from flows.preflight import preflight
 from tests.flows.tiny import tiny_config

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from extrags.config import profile_config
-from extrags.pipeline import STAGES, StageName
+from extrags.stages import STAGES, StageName
 from flows.estimate import RunEstimate, SequenceEstimate, expected_seconds, usual_pace
 from flows.workloads import usual_work
 from tasks.progress import StageProgress

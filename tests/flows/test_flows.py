@@ -19,7 +19,7 @@ import extrags.cores
 import flows.dataset
 import tasks.progress
 from extrags.errors import ConfigError, StoreError
-from extrags.pipeline import STAGES
+from extrags.stages import STAGES
 from extrags.store import Store
 from flows.dataset import reconstruct_dataset
 from flows.outcome import DatasetFailedError, SequenceFailedError, SequenceOutcome

@@ -13,7 +13,7 @@ import pytest
 
 from extrags.config import profile_config
 from extrags.errors import ConfigError
-from extrags.pipeline import StageName
+from extrags.stages import StageName
 from flows.cases import SequenceCase
 from flows.expectation import Expectation, expected_words
 from flows.memory_limit import check_memory

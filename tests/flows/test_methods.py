@@ -12,7 +12,7 @@ import yaml
 from extrags.config import PROFILES, CoarseConfig, PipelineConfig
 from extrags.config.settings import settings_of
 from extrags.errors import ConfigError
-from extrags.pipeline import HELD_OUT_TRAINED_ON, NEED_GAUSSIANS
+from extrags.pipeline import HELD_OUT_TRAINED_ON
 from flows.benchmark import Case, case_of, check_methods
 from flows.methods import (
     METHODS,
@@ -201,7 +201,7 @@ def test_tables_say_which_method_has_seen_held_out_frames() -> None:
 
 def test_a_baseline_of_its_own_representation_leaves_out_what_needs_gaussians() -> None:
     assert method_config("uc-nerf", "quick").uc_nerf.enabled
-    assert set(METHODS["uc-nerf"].leave_out) == set(NEED_GAUSSIANS)
+    assert set(METHODS["uc-nerf"].leave_out) == {"assess", *METHODS["coarse"].leave_out}
     for name in set(METHODS) - {"uc-nerf"}:
         assert not method_config(name, "quick").uc_nerf.enabled
 

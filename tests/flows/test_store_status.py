@@ -12,7 +12,7 @@ import pytest
 from rich.console import Console
 
 from extrags.errors import UnknownSequenceError
-from extrags.pipeline import STAGES
+from extrags.stages import STAGES
 from extrags.store import Store, digest_of
 from extrags.store.runs import recorded_run
 from flows.cases import SequenceCase, record_outcome

@@ -16,7 +16,7 @@ from torch import Tensor
 from extrags.errors import ConfigError, WeightsError
 from extrags.metrics.image import means_in_regions
 from extrags.metrics.registry import Metric, register_metric, unregister_metric
-from extrags.pipeline import STAGES
+from extrags.stages import STAGES
 from extrags.store import Store
 from flows.outcome import SequenceOutcome
 from flows.runners import DirectRunner, NotInStoreError, StoreRunner

@@ -1,0 +1,102 @@
+"""What is looked at before sequences are run, so that it is said at once and not by each run."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from extrags.errors import ConfigError, ExtragsError, SourceError, UnknownSequenceError
+from flows.outcome import SequenceOutcome, StageRow
+
+if TYPE_CHECKING:
+    from extrags.stages import StageName
+    from flows.cases import SequenceCase
+
+__all__ = ["check_methods", "check_names", "check_working_distance", "wrong_source"]
+
+log = logging.getLogger(__name__)
+
+
+def check_names(sequences: list[str]) -> None:
+    """An unknown name is wrong usage and stops everything; a source that is wrong concerns its own run.
+
+    Raises:
+        UnknownSequenceError: for a name that is neither in the catalogue nor a path.
+    """
+    from data_catalog.catalog import resolve
+
+    for sequence in sequences:
+        try:
+            resolve(sequence)
+        except UnknownSequenceError:
+            raise
+        except ExtragsError:
+            continue
+
+
+def check_working_distance(cases: Sequence[SequenceCase]) -> None:
+    """Refuse `poses.working_distance_mm` where no poses are estimated, and warn where some are not.
+
+    Only the poses stage looks at it, which sources with poses of their own skip.
+
+    Raises:
+        ConfigError: every sequence that it is given for has poses.
+    """
+    from data_catalog import describe, glance
+
+    given, posed = set(), []
+    for case in cases:
+        config = case.config()
+        if config.poses.working_distance_mm is None or config.poses.replace_given or case.sequence in given:
+            continue
+        given.add(case.sequence)
+        try:
+            about = glance(case.sequence, config.ingest) or describe(case.sequence)
+        except (ConfigError, SourceError, UnknownSequenceError):
+            # What is wrong with a source is said by the run, for each by itself.
+            continue
+        if about.has_poses:
+            posed.append(case.sequence)
+    if not posed:
+        return
+    first = posed[0] if len(posed) == 1 else f"{posed[0]} and {len(posed) - 1} more"
+    problem = (
+        f"{first}: poses.working_distance_mm makes estimated poses metric, and these are the source's own; "
+        "ingest.scale_mm_per_unit (--scale) says what their unit is where it is arbitrary, and "
+        "poses.replace_given estimates others in their place"
+    )
+    if len(posed) == len(given):
+        raise ConfigError(problem)
+    log.warning("%s", problem)
+
+
+def wrong_source(case: SequenceCase, until: StageName) -> SequenceOutcome | None:
+    """How a run would fail whose source can be seen to be wrong without reading pictures; else None."""
+    from data_catalog import glance
+    from data_catalog.names import plain_name
+    from extrags.stages import stages_until
+
+    try:
+        glance(case.sequence, case.config().ingest)
+    except SourceError as error:
+        rest = stages_until(until)[1:]
+        rows = [StageRow("ingest", "failed", reason=str(error))]
+        rows += [StageRow(stage, "skipped", reason="ingest failed") for stage in rest]
+        return SequenceOutcome(plain_name(case.sequence), "failed", rows, error=error)
+    return None
+
+
+def check_methods(cases: Sequence[SequenceCase], methods: Sequence[str], until: StageName) -> None:
+    """Look for what each method needs, with the settings of its first case.
+
+    Raises:
+        ExtragsError: see `flows.preflight.preflight`.
+    """
+    from flows.methods import METHODS
+    from flows.preflight import preflight
+
+    for method in methods:
+        first = next((case for case in cases if case.method == method), None)
+        if first is not None:
+            preflight(first.config(), until, METHODS[method].leave_out)
