@@ -21,7 +21,7 @@ from jaxtyping import Float, Int
 
 from extrags.cameras import Cameras
 from extrags.confidence import PerceptualDifference
-from extrags.config import CoarseConfig, EnhanceConfig, FinetuneConfig
+from extrags.config import DEFAULT_PROFILE, PROFILES, CoarseConfig, EnhanceConfig, FinetuneConfig
 from extrags.evaluation import render
 from extrags.events import MetricRecorded, Progress, emit
 from extrags.metrics.image import psnr_per_image
@@ -167,9 +167,9 @@ def judge_finetuning(
         sequence: posed frames; only training frames are used.
         trajectories: virtual views of each trajectory, its real start first.
         enhancer: the scene's restorer; None where there are no virtual views.
-        config: settings of the fine-tuning; None takes the defaults.
-        enhance: settings of the restoration; None takes the defaults.
-        coarse: settings the scene was reconstructed with; None takes the defaults.
+        config: settings of the fine-tuning; None takes those of the profile `balanced`.
+        enhance: settings of the restoration; None takes those of the profile `balanced`.
+        coarse: settings the scene was reconstructed with; None takes those of the profile `balanced`.
         measure: behind the pixel-level confidence; None takes LPIPS where its weights can be found.
 
     Returns:
@@ -178,9 +178,9 @@ def judge_finetuning(
     Raises:
         DivergedError: when an optimisation does not stay finite.
     """
-    config = FinetuneConfig() if config is None else config
-    enhance = EnhanceConfig() if enhance is None else enhance
-    coarse = CoarseConfig() if coarse is None else coarse
+    config = PROFILES[DEFAULT_PROFILE].finetune if config is None else config
+    enhance = PROFILES[DEFAULT_PROFILE].enhance if enhance is None else enhance
+    coarse = PROFILES[DEFAULT_PROFILE].coarse if coarse is None else coarse
     settings, n_frames = config.judge, len(sequence.train)
     if not settings.enabled:
         return Judgement(1.0, "not judged: finetune.judge.enabled is off")

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 from torch.nn import functional
 
-from extrags.config import PosesConfig
+from extrags.config import DEFAULT_PROFILE, PROFILES, PosesConfig
 from extrags.config.depth import DepthConfig
 from extrags.depth.completion import CompletionNetwork, completion_inputs
 from extrags.depth.edges import sharpened
@@ -141,8 +141,9 @@ def estimate_depth(
 
     Args:
         sequence: with poses.
-        config: what to use; None takes the defaults.
-        poses: settings of the features that points are triangulated from; None takes the defaults.
+        config: what to use; None takes those of the profile `balanced`.
+        poses: settings of the features that points are triangulated from; None takes those of the profile
+            `balanced`.
         monocular: a network of the caller's own; None loads that of the settings, if they name one.
         stage: named in progress events.
 
@@ -153,7 +154,7 @@ def estimate_depth(
         WeightsError: when the weights of a network cannot be read.
         MissingDependencyError: when a monocular network is asked for without the package it needs.
     """
-    config = DepthConfig() if config is None else config
+    config = PROFILES[DEFAULT_PROFILE].depth if config is None else config
     if sequence.lens is not None:
         flat = sequence.as_pinhole(WIDE_FIELD_DEG)
         return _through_lens(
@@ -162,6 +163,7 @@ def estimate_depth(
     device = chosen_device(config.device, "depth.device")
     if len(sequence) < 2:
         raise CaptureError(f"{sequence.name}: depth from other frames needs at least two, found one")
+    poses = PROFILES[DEFAULT_PROFILE].poses if poses is None else poses
     points, points_rgb, origin = _points(sequence, config, poses)
     small = sequence.at_most_width(config.max_width)
     near, typical, far = _ranges(small, points, config)
@@ -279,7 +281,7 @@ def posed_frames(sequence: EndoscopicSequence, device: torch.device | str = "cpu
 
 
 def _points(
-    sequence: EndoscopicSequence, config: DepthConfig, poses: PosesConfig | None
+    sequence: EndoscopicSequence, config: DepthConfig, poses: PosesConfig
 ) -> tuple[np.ndarray, np.ndarray, str]:
     """Sparse points, their colours, and where they come from."""
     if sequence.points is not None and len(sequence.points) >= MIN_POINTS:

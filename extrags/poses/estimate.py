@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from extrags.cameras import as_rotation
-from extrags.config import IngestConfig, PosesConfig
+from extrags.config import DEFAULT_PROFILE, PROFILES, IngestConfig, PosesConfig
 from extrags.errors import CaptureError, ConfigError, ShapeError
 from extrags.frame_stacks import frames_of, stacked
 from extrags.poses.attempts import attempted, enough_registered
@@ -143,7 +143,7 @@ def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig | None = No
 
     Args:
         sequence: frames with intrinsics; poses it may have are not looked at.
-        config: settings; None takes the defaults.
+        config: settings; None takes those of the profile `balanced`.
 
     Returns:
         Poses of the frames that registered; the others are named in the log and in the report.
@@ -156,7 +156,7 @@ def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig | None = No
 
     Source: Schönberger and Frahm: Structure-from-Motion Revisited, CVPR 2016.
     """
-    config = PosesConfig() if config is None else config
+    config = PROFILES[DEFAULT_PROFILE].poses if config is None else config
     # COLMAP and the alignment are told of pinholes; poses are those of the frames.
     native, sequence = sequence.lens is not None, sequence.as_pinhole()
     if not sequence.training_depth_known:
@@ -368,8 +368,8 @@ def with_estimated_poses(
     Args:
         sequence: what poses were estimated of.
         estimate: of its frames.
-        ingest: settings of reading, which say what becomes of frames of a distorted lens; None takes the
-            defaults.
+        ingest: settings of reading, which say what becomes of frames of a distorted lens; None takes
+            those of the profile `balanced`.
 
     Raises:
         ShapeError: when the estimate is of another sequence.

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
 from extrags.cameras import rays_of_pixels
-from extrags.config import CoarseConfig, FinetuneConfig
+from extrags.config import DEFAULT_PROFILE, PROFILES, CoarseConfig, FinetuneConfig
 from extrags.frame_quantiles import quantile_of_frames
 from extrags.frame_stacks import stacked
 from extrags.gaussians import Gaussians
@@ -106,8 +106,9 @@ def finetune(
         scene: the coarse scene; the optimisation runs where it is, and so does the result.
         sequence: posed frames; only training frames are used.
         pseudo_views: restored virtual views with confidences, or None.
-        config: budgets and shares; None takes the defaults.
-        coarse: rates and weights, those the coarse scene was made with; None takes the defaults.
+        config: budgets and shares; None takes those of the profile `balanced`.
+        coarse: rates and weights, those the coarse scene was made with; None takes those of the profile
+            `balanced`.
         stage: named in progress events.
         frame_weights: of the training frames, where they are known from the reconstruction; None looks for
             blurred frames where `coarse.inconsistent_frames` is `weight`.
@@ -121,8 +122,8 @@ def finetune(
     """
     # Not as a decorator, which would hold the virtual views for its caller.
     with one_torch_thread():
-        config = FinetuneConfig() if config is None else config
-        coarse = CoarseConfig() if coarse is None else coarse
+        config = PROFILES[DEFAULT_PROFILE].finetune if config is None else config
+        coarse = PROFILES[DEFAULT_PROFILE].coarse if coarse is None else coarse
         frames = sequence.train
         depth = median_depth(sequence, frames)
         max_gaussians = round(config.growth * coarse.densify.max_gaussians)

@@ -11,7 +11,7 @@ from jaxtyping import Int
 
 from extrags.arguments import check_sequence_argument, check_settings_argument
 from extrags.cameras import Cameras
-from extrags.config import CoarseConfig, DensifyConfig
+from extrags.config import DEFAULT_PROFILE, PROFILES, CoarseConfig, DensifyConfig
 from extrags.errors import CaptureError, ConfigError
 from extrags.illumination import NearFieldLight
 from extrags.scene import NEAR, SHALLOWEST, Scene
@@ -44,7 +44,7 @@ def reconstruct(
 
     Args:
         sequence: posed frames.
-        config: budgets, rates and weights; None takes the defaults.
+        config: budgets, rates and weights; None takes those of the profile `balanced`.
         frames: which frames to use; default: those of `config.train_on`, the split's training frames or,
             for the oracle, all.
         stage: named in progress events.
@@ -70,7 +70,7 @@ def reconstruct(
     docs/references.md.
     """
     check_sequence_argument(sequence, "reconstruct")
-    config = CoarseConfig() if config is None else config
+    config = PROFILES[DEFAULT_PROFILE].coarse if config is None else config
     check_settings_argument(config, CoarseConfig, "reconstruct", 'extrags.PROFILES["quick"].coarse')
     if not sequence.training_depth_known:
         # The oracle is given held-out frames too, whose depth is for the evaluation alone.

@@ -181,9 +181,10 @@ def _known(name: str) -> Descriptor | None:
 
 
 def _ingest(given: argparse.Namespace) -> IngestConfig:
+    from extrags.config import DEFAULT_PROFILE
     from flows.settings import pipeline_config
 
-    return pipeline_config("balanced", given.settings).ingest
+    return pipeline_config(DEFAULT_PROFILE, given.settings).ingest
 
 
 def _write_picture(sequence: EndoscopicSequence, target: Path) -> None:

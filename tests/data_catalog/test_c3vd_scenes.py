@@ -373,7 +373,7 @@ def simulated(shared_data: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def simulated_sparse(simulated: Path) -> EndoscopicSequence:
-    return read(f"{SCENE}@sparse")
+    return read(f"{SCENE}@sparse", IngestConfig(size="thumbnail"))
 
 
 class TestSimulatedSet:

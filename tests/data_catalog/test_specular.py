@@ -9,6 +9,7 @@ from PIL import Image
 
 from data_catalog.catalog import read
 from data_catalog.specular import specular_mask, specular_masks, with_specular
+from extrags.config import IngestConfig
 from extrags.sequence import saturated_mask
 
 
@@ -83,7 +84,7 @@ def test_a_sequence_gets_its_highlights_and_keeps_them(clip, tmp_path) -> None:
 
 class TestRealImages:
     def test_sinus_shows_one_bright_reflex(self, shared_data) -> None:
-        sequence = read(shared_data / "sinus_hopkins")
+        sequence = read(shared_data / "sinus_hopkins", IngestConfig(size="thumbnail"))
         found = specular_masks(sequence.rgb, sequence.mask)
         share = found[sequence.mask].mean()
         assert 0.001 < share < 0.02
