@@ -279,7 +279,7 @@ def _resampled(sequence: EndoscopicSequence, plan: Undistortion) -> EndoscopicSe
     return replace(
         sequence,
         K=np.tile(plan.K, (len(sequence), 1, 1)),
-        rgb=through(plan.colour, sequence.rgb),
+        rgb=through(plan.color, sequence.rgb),
         mask=through(plan.mask, sequence.mask),
         depth_mm=through(plan.depth, sequence.depth_mm),
         withheld_depth_mm=through(plan.depth, sequence.withheld_depth_mm),

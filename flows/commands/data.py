@@ -157,9 +157,9 @@ def check(given: argparse.Namespace) -> int:
             for note in found.notes:
                 out.print(f"  note: {escape(note)}", soft_wrap=True)
             for finding in found.findings:
-                colour = "red" if finding.kind == "error" else "yellow"
+                color = "red" if finding.kind == "error" else "yellow"
                 out.print(
-                    f"  [{colour}]{finding.kind}[/] {escape(finding.topic)}: {escape(str(finding))}",
+                    f"  [{color}]{finding.kind}[/] {escape(finding.topic)}: {escape(str(finding))}",
                     soft_wrap=True,
                 )
             if found.facts is not None:

@@ -20,8 +20,8 @@ def mucosa(width: int = 320, height: int = 256) -> np.ndarray:
     light = 0.9 - 0.5 * np.hypot(x - 0.3, y - 0.3)
     vessels = 1 - 0.2 * (np.abs(np.sin(18 * x + 4 * np.sin(9 * y))) < 0.12)
     lumen = np.where(np.hypot(x - 0.7, y - 0.5) < 0.15, 0.15, 1.0)
-    colour = np.array([215, 120, 95])
-    image = (light * vessels * lumen)[..., None] * colour + rng.normal(0, 2, (height, width, 3))
+    color = np.array([215, 120, 95])
+    image = (light * vessels * lumen)[..., None] * color + rng.normal(0, 2, (height, width, 3))
     return np.clip(image, 0, 255).astype(np.uint8)
 
 
