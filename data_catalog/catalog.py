@@ -23,7 +23,7 @@ from data_catalog.footage import DICOM_SUFFIXES, VIDEO_SUFFIXES
 from data_catalog.phantom.dataset import PHANTOM
 from data_catalog.specular import with_specular
 from extrags.arguments import check_settings_argument
-from extrags.config import IngestConfig
+from extrags.config import DEFAULT_PROFILE, PROFILES, IngestConfig
 from extrags.errors import ConfigError, SourceNotFoundError, UnknownSequenceError
 from extrags.redaction import without_credentials
 from extrags.scarce_depth import without_scarce_depth
@@ -104,7 +104,7 @@ def glance(name_or_path: str | Path, config: IngestConfig | None = None) -> Glan
 
     Args:
         name_or_path: what `resolve` takes.
-        config: settings it would be read with; defaults where None.
+        config: settings it would be read with; None takes those of the profile `balanced`.
 
     Returns:
         None for a sequence that another dataset knows: its `Descriptor` tells. With `ingest.size` = detail
@@ -128,7 +128,7 @@ def read(source: Source | str | Path, config: IngestConfig | None = None) -> End
 
     Args:
         source: what `resolve` returns, or takes.
-        config: size, frames and split; defaults where None.
+        config: size, frames and split; None takes those of the profile `balanced`.
 
     Raises:
         SourceError: a file is wrong; names file, frame and field. `SourceNotFoundError` and `PoseError`
@@ -204,12 +204,12 @@ def source_fingerprint(source: Source | str | Path, config: IngestConfig | None 
 
 
 def _settings(config: IngestConfig | None, function: str) -> IngestConfig:
-    """What a function was given, or the defaults.
+    """What a function was given, or the settings of the profile `balanced`.
 
     Raises:
         ConfigError: other settings, such as those of all stages, or a size that is given twice.
     """
-    config = IngestConfig() if config is None else config
+    config = PROFILES[DEFAULT_PROFILE].ingest if config is None else config
     check_settings_argument(config, IngestConfig, function, 'extrags.PROFILES["quick"].ingest')
     if config.width is not None and config.downscale is not None:
         raise ConfigError(

@@ -17,7 +17,7 @@ from data_catalog.calibration_files import with_calibration_file
 from data_catalog.dataset import Descriptor, Source
 from data_catalog.folder_reader import FolderReader, Glance
 from data_catalog.footage import DICOM_SUFFIXES, VIDEO_SUFFIXES, files_of_kind
-from data_catalog.images import COLOUR_SUFFIXES, image_entries, natural_key
+from data_catalog.images import COLOR_SUFFIXES, image_entries, natural_key
 from data_catalog.named_folders import find_folder, not_on_this_machine
 from data_catalog.posed_frames import SourceFrames
 from data_catalog.readers import (
@@ -176,7 +176,7 @@ def _recognised(path: Path) -> FolderReader:
         )
     # Those of the catalogue are described where the message says; others nowhere else.
     more = "".join(f", {reader.name} ({reader.summary})" for reader in _registered)
-    kinds = ", ".join(COLOUR_SUFFIXES)
+    kinds = ", ".join(COLOR_SUFFIXES)
     raise SourceNotFoundError(
         f"no sequence recognised in this folder{_what_is_there(path)}; expected images ({kinds}) in it, "
         "in images/ or in rgb/, a video, a DICOM file, a COLMAP model, "

@@ -20,12 +20,12 @@ from extrags.events import Progress, emit
 from extrags.sequence import EndoscopicSequence
 
 __all__ = [
-    "COLOUR_SUFFIXES",
+    "COLOR_SUFFIXES",
     "DEPTH_SUFFIXES",
     "UPRIGHT",
     "bits_per_value",
     "check_links",
-    "colour_files",
+    "color_files",
     "depth_suffixes_in_words",
     "file_key",
     "image_entries",
@@ -33,7 +33,7 @@ __all__ = [
     "natural_key",
     "order_for_fingerprint",
     "orientation",
-    "read_colour",
+    "read_color",
     "read_depth",
     "read_mask",
     "save_images",
@@ -47,7 +47,7 @@ _ORIENTATION = 274
 UPRIGHT = 1
 """Orientation of images whose pixels lie as they are shown."""
 _TIFF_SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-COLOUR_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+COLOR_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 DEPTH_SUFFIXES = (".npy", ".tiff", ".tif", ".png")
 _MASK_THRESHOLD = 127
 _LOSSY_SUFFIXES = (".jpg", ".jpeg")
@@ -70,7 +70,7 @@ def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
 def file_key(name: str) -> tuple[tuple[tuple[int, int, str], ...], str]:
     """Sort key of an image's name or path: by `natural_key` without suffix, `a.png` before `a (2).png`."""
     stem, _, suffix = name.rpartition(".")
-    return natural_key(stem if f".{suffix.lower()}" in COLOUR_SUFFIXES else name), name
+    return natural_key(stem if f".{suffix.lower()}" in COLOR_SUFFIXES else name), name
 
 
 def order_for_fingerprint(names: Iterable[str]) -> dict[str, Any]:
@@ -87,7 +87,7 @@ def order_for_fingerprint(names: Iterable[str]) -> dict[str, Any]:
     return {} if listed == sorted(listed, key=file_key) else {"order": "without suffixes"}
 
 
-def colour_files(folder: Path) -> list[Path]:
+def color_files(folder: Path) -> list[Path]:
     """Image files directly in a folder that is read, in natural order.
 
     Raises:
@@ -106,7 +106,7 @@ def image_entries(folder: Path) -> list[Path]:
     named = [
         file
         for file in folder.iterdir()
-        if file.suffix.lower() in COLOUR_SUFFIXES
+        if file.suffix.lower() in COLOR_SUFFIXES
         and not file.name.startswith(".")
         and (file.is_file() or _leads_nowhere(file))
     ]
@@ -128,7 +128,7 @@ def _leads_nowhere(file: Path) -> bool:
     return file.is_symlink() and not file.exists()
 
 
-def read_colour(file: Path, *, frame: object = None) -> UInt8[np.ndarray, "h w 3"]:
+def read_color(file: Path, *, frame: object = None) -> UInt8[np.ndarray, "h w 3"]:
     """Read an image as 8-bit RGB; of files with more bits the high ones, alpha is dropped.
 
     Pixels are those of the file, whatever its EXIF orientation says (`orientation`).
@@ -179,7 +179,7 @@ def bits_per_value(file: Path) -> int:
     """
     from PIL import Image
 
-    if file.suffix.lower() not in COLOUR_SUFFIXES:
+    if file.suffix.lower() not in COLOR_SUFFIXES:
         return 8
     with _image_errors(file, None, "rgb"), Image.open(file) as image:
         told = getattr(image, "tag_v2", {}).get(BITS_PER_SAMPLE)
@@ -190,14 +190,14 @@ def bits_per_value(file: Path) -> int:
 
 
 def orientation(file: Path) -> int:
-    """How viewers turn an image that `read_colour` has read: EXIF's 1 to 8, `UPRIGHT` where nothing says so.
+    """How viewers turn an image that `read_color` has read: EXIF's 1 to 8, `UPRIGHT` where nothing says so.
 
-    COLMAP and instant-ngp take pixels as they are stored, and so does `read_colour`; OpenCV turns them. Of a
+    COLMAP and instant-ngp take pixels as they are stored, and so does `read_color`; OpenCV turns them. Of a
     TIFF, the orientation is part of its layout: Pillow has applied it, and nothing is left to turn.
     """
     from PIL import Image
 
-    if file.suffix.lower() not in COLOUR_SUFFIXES:
+    if file.suffix.lower() not in COLOR_SUFFIXES:
         return UPRIGHT
     try:
         with warnings.catch_warnings(), _image_errors(file, None, "rgb"), Image.open(file) as image:
@@ -332,16 +332,16 @@ def _stored_numbers(file: Path, frame: object) -> np.ndarray:
         image.load()
         if image.mode not in ("P", "PA"):
             return np.asarray(image)
-        colours = np.asarray(image.convert("RGB"))
+        colors = np.asarray(image.convert("RGB"))
     # Programs that make files smaller store grey of few values as places in a palette.
-    if (colours != colours[..., :1]).any():
+    if (colors != colors[..., :1]).any():
         raise SourceError(
             "colours of a palette; expected one number per pixel, not depth in false colours",
             file=file,
             frame=frame,
             field="depth",
         )
-    return colours[..., 0]
+    return colors[..., 0]
 
 
 def depth_suffixes_in_words() -> str:

@@ -191,8 +191,8 @@ def contact_sheet(sequence: EndoscopicSequence) -> UInt8[np.ndarray, "h w 3"]:
             cv2.rectangle(tile, (1, 1), (_TILE_WIDTH - 2, tile.shape[0] - 2), (255, 210, 0), 2)
         label = sequence.frame_name(index)
         # Dark below light, to be read on any picture.
-        for colour, width in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-            cv2.putText(tile, label, (6, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, width, cv2.LINE_AA)
+        for color, width in (((0, 0, 0), 3), ((255, 255, 255), 1)):
+            cv2.putText(tile, label, (6, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45, color, width, cv2.LINE_AA)
         tiles.append(tile)
     columns = min(count, max(1, round(math.sqrt(count * tiles[0].shape[0] * 1.6 / _TILE_WIDTH))))
     blank = np.zeros_like(tiles[0])

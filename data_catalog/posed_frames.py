@@ -20,11 +20,11 @@ from data_catalog.depth_steps import DepthSteps
 from data_catalog.guessed_intrinsics import fitted_to_picture
 from data_catalog.image_pages import tell_about_pages
 from data_catalog.images import (
-    COLOUR_SUFFIXES,
+    COLOR_SUFFIXES,
     UPRIGHT,
     bits_per_value,
     orientation,
-    read_colour,
+    read_color,
     read_depth,
     read_mask,
     spread,
@@ -102,8 +102,8 @@ class MaskFinder(Protocol):
         """The mask of a frame's recording, once all frames were seen."""
 
 
-def _colour_of(frame: PosedFrame) -> UInt8[np.ndarray, "h w 3"]:
-    return read_colour(frame.file, frame=frame.label)
+def _color_of(frame: PosedFrame) -> UInt8[np.ndarray, "h w 3"]:
+    return read_color(frame.file, frame=frame.label)
 
 
 def _depth_of(file: Path, label: str | int) -> Float[np.ndarray, "h w"]:
@@ -120,7 +120,7 @@ class SourceFrames:
         metric: whether lengths are millimetres.
         intrinsics_file: says for images of which size the lenses hold; None where they were made for the
             images there are.
-        read_colour: a frame's image; asked for once, in order.
+        read_color: a frame's image; asked for once, in order.
         read_depth: file and frame's label to z-depth in the sequence's unit, 0 where unknown.
         white_is_tissue: polarity of mask files.
         masks: finds masks of frames without a file; None leaves such frames whole.
@@ -141,7 +141,7 @@ class SourceFrames:
     pose_file: Path
     metric: bool
     intrinsics_file: Path | None = None
-    read_colour: Callable[[PosedFrame], UInt8[np.ndarray, "h w 3"]] = _colour_of
+    read_color: Callable[[PosedFrame], UInt8[np.ndarray, "h w 3"]] = _color_of
     read_depth: Callable[[Path, str | int], Float[np.ndarray, "h w"]] = _depth_of
     white_is_tissue: bool = True
     masks: MaskFinder | None = None
@@ -182,7 +182,7 @@ def assembled(source: SourceFrames, config: IngestConfig, name: str) -> Endoscop
     _tell_about_orientation(kept)
     tell_about_pages(kept[0].file)
     K = np.stack([pixels.samplings[frame.lens].K for frame in kept])
-    rgb, mask = pixels.colours.array, pixels.masks(kept)
+    rgb, mask = pixels.colors.array, pixels.masks(kept)
     if source.intrinsics == "guessed":
         K = fitted_to_picture(K, mask)
     lens = pixels.lens(kept, source.pose_file)
@@ -267,7 +267,7 @@ class _Pixels:
         self.source = source
         self.config = config
         self.samplings: dict[CameraModel, Sampling] = {}
-        self.colours = FrameStack(count)
+        self.colors = FrameStack(count)
         self.depths = FrameStack(count)
         self.brightest = 0
         self._unknown_depth = UnknownDepth()
@@ -281,13 +281,13 @@ class _Pixels:
     def read(self, frame: PosedFrame) -> None:
         """Take in the next frame."""
         source = self.source
-        image = source.read_colour(frame)
+        image = source.read_color(frame)
         _check_size(image, frame, frame.file, "rgb", source.intrinsics_file)
         sampling = self._sampling(frame)
         if self._use is not None:
-            self._use.see(len(self.colours), frame.lens, sampling, image)
-        sampled = sampling.colour(image, file=frame.file, frame=frame.label)
-        sampled = self.colours.append(sampled)
+            self._use.see(len(self.colors), frame.lens, sampling, image)
+        sampled = sampling.color(image, file=frame.file, frame=frame.label)
+        sampled = self.colors.append(sampled)
         self.brightest = max(self.brightest, int(sampled.max()))
         if frame.mask_file is None and source.masks is not None:
             source.masks.see(frame, image, sampled)
@@ -374,7 +374,7 @@ class _Pixels:
                 mask = read_mask(file, frame=frame.label) == self.source.white_is_tissue
                 _check_size(mask, frame, file, "mask", None)
                 if self._use is not None:
-                    self._use.see_mask(len(self.colours) - 1, lens, mask)
+                    self._use.see_mask(len(self.colors) - 1, lens, mask)
             self._last_mask = (file, lens, sampling.mask(mask, file=file, frame=frame.label))
         return self._last_mask[2]
 
@@ -428,7 +428,7 @@ def _rolled(poses: Float[np.ndarray, "f 4 4"], rolls_rad: Sequence[float]) -> Fl
 def _frame_names(frames: Sequence[PosedFrame]) -> tuple[str, ...]:
     """Names without an image's suffix; folder, then suffix stay where names would otherwise meet."""
     named = [Path(frame.name) for frame in frames]
-    bare = [name.with_suffix("") if name.suffix.lower() in COLOUR_SUFFIXES else name for name in named]
+    bare = [name.with_suffix("") if name.suffix.lower() in COLOR_SUFFIXES else name for name in named]
     short = tuple(name.name for name in bare)
     if len(set(short)) == len(short):
         return short

@@ -96,7 +96,7 @@ class Resampling:
         moved[1] *= self.height / self.crop_height
         return moved
 
-    def colour(
+    def color(
         self, image: UInt8[np.ndarray, "h w 3"], *, file: object = None, frame: object = None
     ) -> UInt8[np.ndarray, "h2 w2 3"]:
         """Area-averaged colours.

@@ -70,7 +70,7 @@ class Sampling(Protocol):
     def height(self) -> int:
         """Rows of the result."""
 
-    def colour(
+    def color(
         self, image: UInt8[np.ndarray, "h w 3"], *, file: object = None, frame: object = None
     ) -> UInt8[np.ndarray, "h2 w2 3"]:
         """Averaged colours."""
@@ -245,7 +245,7 @@ class LensSampling:
         """Rows of the result."""
         return self.resampling.height
 
-    def colour(
+    def color(
         self, image: UInt8[np.ndarray, "h w 3"], *, file: object = None, frame: object = None
     ) -> UInt8[np.ndarray, "h2 w2 3"]:
         """Averaged colours; black where the lens saw nothing.
@@ -253,8 +253,8 @@ class LensSampling:
         Raises:
             SourceError: the image is not of the sequence's size.
         """
-        straight = image if self.undistortion is None else self.undistortion.colour(image)
-        return self.resampling.colour(straight, file=file, frame=frame)
+        straight = image if self.undistortion is None else self.undistortion.color(image)
+        return self.resampling.color(straight, file=file, frame=frame)
 
     def mask(
         self, mask: Bool[np.ndarray, "h w"], *, file: object = None, frame: object = None

@@ -11,7 +11,7 @@ from jaxtyping import Bool
 from torch.nn import functional
 
 from extrags.cameras import Cameras, rotation_about
-from extrags.config import PROFILES, AssessConfig, CoverageConfig, PipelineConfig
+from extrags.config import DEFAULT_PROFILE, PROFILES, AssessConfig, CoverageConfig, PipelineConfig
 from extrags.errors import CaptureError
 from extrags.events import Progress, emit
 from extrags.exploration.coverage import direction_counts, training_coverage
@@ -50,7 +50,7 @@ def assess(scene: Scene, sequence: EndoscopicSequence, config: PipelineConfig | 
     Raises:
         CaptureError: as `measure`.
     """
-    config = PROFILES["balanced"] if config is None else config
+    config = PROFILES[DEFAULT_PROFILE] if config is None else config
     return decide(measure(scene, sequence, config.assess, config.explore.coverage), config)
 
 

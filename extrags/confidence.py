@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from extrags.config import EvaluateConfig, IouSet
+from extrags.config import DEFAULT_PROFILE, PROFILES, EvaluateConfig, IouSet
 from extrags.errors import ShapeError, WeightsError
 from extrags.metrics.lpips import MIN_SIDE_PX, Lpips
 from extrags.metrics.perceptual import perceptual_map
@@ -100,12 +100,13 @@ class PerceptualDifference:
         """LPIPS if its weights can be found, else `perceptual_map`.
 
         Args:
-            config: its first backbone, and optionally where the weights are; None takes the defaults.
+            config: its first backbone, and optionally where the weights are; None takes those of the profile
+                `balanced`.
 
         Raises:
             WeightsError: when the settings name a file that cannot be used.
         """
-        config = EvaluateConfig() if config is None else config
+        config = PROFILES[DEFAULT_PROFILE].evaluate if config is None else config
         try:
             return cls(Lpips.load(config.lpips_weights, config.lpips_nets[0]))
         except WeightsError as error:

@@ -81,7 +81,7 @@ def evaluate_renders(
         sequence: the sequence of these frames.
         mesh: the scene's surface (`extrags.metrics.surface.scene_surface`); None where it has none.
         true_surface: ground truth of the surface; None omits the surface metrics.
-        lpips: LPIPS by backbone; None searches for the weights of the default backbones.
+        lpips: LPIPS by backbone; None searches for the weights of the backbones of the profile `balanced`.
         per_view: as `extrags.metrics.protocol.evaluate_views` takes it.
         device: where colours are compared.
 
@@ -118,7 +118,7 @@ def evaluate(
         scene: the scene.
         sequence: posed frames, including the held-out ones.
         true_surface: ground truth of the surface; None omits the surface metrics.
-        lpips: LPIPS by backbone; None searches for the weights of the default backbones.
+        lpips: LPIPS by backbone; None searches for the weights of the backbones of the profile `balanced`.
 
     Raises:
         ShapeError: when there is no held-out frame.

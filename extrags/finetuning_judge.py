@@ -21,7 +21,7 @@ from jaxtyping import Float, Int
 
 from extrags.cameras import Cameras
 from extrags.confidence import PerceptualDifference
-from extrags.config import CoarseConfig, EnhanceConfig, FinetuneConfig
+from extrags.config import DEFAULT_PROFILE, PROFILES, CoarseConfig, EnhanceConfig, FinetuneConfig
 from extrags.evaluation import render
 from extrags.events import MetricRecorded, Progress, emit
 from extrags.metrics.image import psnr_per_image
@@ -34,7 +34,7 @@ from extrags.sequence import EndoscopicSequence, Split
 from extrags.store.storable import Storable
 from extrags.threads import one_torch_thread
 from extrags.training.finetuning import finetune
-from extrags.training.frame_weights import frame_weights
+from extrags.training.frame_weights import FrameWeights, frame_weights
 from extrags.training.leave_out import MIN_FRAMES, leave_out_folds, partial_scene
 
 __all__ = ["AMOUNTS", "Judgement", "Trial", "decide", "judge_finetuning"]
@@ -167,9 +167,9 @@ def judge_finetuning(
         sequence: posed frames; only training frames are used.
         trajectories: virtual views of each trajectory, its real start first.
         enhancer: the scene's restorer; None where there are no virtual views.
-        config: settings of the fine-tuning; None takes the defaults.
-        enhance: settings of the restoration; None takes the defaults.
-        coarse: settings the scene was reconstructed with; None takes the defaults.
+        config: settings of the fine-tuning; None takes those of the profile `balanced`.
+        enhance: settings of the restoration; None takes those of the profile `balanced`.
+        coarse: settings the scene was reconstructed with; None takes those of the profile `balanced`.
         measure: behind the pixel-level confidence; None takes LPIPS where its weights can be found.
 
     Returns:
@@ -178,25 +178,84 @@ def judge_finetuning(
     Raises:
         DivergedError: when an optimisation does not stay finite.
     """
-    config = FinetuneConfig() if config is None else config
-    enhance = EnhanceConfig() if enhance is None else enhance
-    coarse = CoarseConfig() if coarse is None else coarse
-    settings = config.judge
-    frames = np.asarray(sequence.train, dtype=np.int64)
+    config = PROFILES[DEFAULT_PROFILE].finetune if config is None else config
+    enhance = PROFILES[DEFAULT_PROFILE].enhance if enhance is None else enhance
+    coarse = PROFILES[DEFAULT_PROFILE].coarse if coarse is None else coarse
+    settings, n_frames = config.judge, len(sequence.train)
     if not settings.enabled:
         return Judgement(1.0, "not judged: finetune.judge.enabled is off")
-    if len(frames) < MIN_FRAMES:
+    if n_frames < MIN_FRAMES:
         return Judgement(
-            1.0, f"not judged: of {len(frames)} training frames none can be left out (at least {MIN_FRAMES})"
+            1.0, f"not judged: of {n_frames} training frames none can be left out (at least {MIN_FRAMES})"
         )
-    arms, left, weights_of_arms = [], [], []
-    weighted = coarse.inconsistent_frames == "weight"
-    for part, positions in _without_some_frames(
-        sequence.at_most_width(settings.max_width), frames, settings.leave_out_every
-    ):
-        left.append(positions)
+    arms = list(_arms(scene, sequence, trajectories, enhancer, config, enhance, coarse, measure))
+    if not arms:
+        return Judgement(1.0, "not judged: no training frame that can be left out has a valid pixel")
+    scenes: dict[float | None, list[Scene]] = {None: [arm.start for arm in arms]}
+    before = _psnr_of_arms(arms, scenes[None])
+    scenes[0.0] = _finetuned(arms, 0.0, config, coarse)
+    control = _psnr_of_arms(arms, scenes[0.0])
+    trials = [_trial(0.0, before, control, control)]
+    for amount in AMOUNTS if enhancer is not None else ():
+        scenes[amount] = _finetuned(arms, amount, config, coarse)
+        trials.append(_trial(amount, before, _psnr_of_arms(arms, scenes[amount]), control))
+        if trials[-1].holds(settings.max_loss_db):
+            break
+    for trial in trials:
+        emit(MetricRecorded("finetune", f"left_out_gain_db_at_{trial.amount:g}", trial.gain_db))
+    left = np.sort(np.concatenate([arm.left_out for arm in arms]))
+    judgement = decide(trials, settings.max_loss_db, left)
+    if config.keep_scene:
+        judgement = replace(judgement, reason=f"{KEPT}; {judgement.reason}")
+    if enhancer is not None:
+        share = np.mean([_error_share(scene, sequence, arm.start, arm.sequence) for arm in arms])
+        shown = (
+            (arm.start, render(final, arm.sequence), arm.sequence)
+            for arm, final in zip(arms, scenes[judgement.amount], strict=True)
+        )
+        shares = restored_shares(shown, enhancer, enhance, error_share=float(share))
+        judgement = replace(judgement, restored_shares=shares)
+    logger.info("finetune: %s", judgement.reason)
+    return judgement
+
+
+@dataclass(frozen=True)
+class _Arm:
+    """A brief reconstruction without some training frames, and what it is fine-tuned on.
+
+    Args:
+        sequence: the frames, at the size of trials; those left out are held out.
+        left_out: their positions among the training frames.
+        start: the brief reconstruction.
+        views: its virtual views, restored; None without a restorer.
+        frame_weights: of the frames it was made from; None where they count alike.
+    """
+
+    sequence: EndoscopicSequence
+    left_out: Int[np.ndarray, "m"]
+    start: Scene
+    views: PseudoViews | None
+    frame_weights: FrameWeights | None
+
+
+def _arms(
+    scene: Scene,
+    sequence: EndoscopicSequence,
+    trajectories: Sequence[Cameras],
+    enhancer: Enhancer | None,
+    config: FinetuneConfig,
+    enhance: EnhanceConfig,
+    coarse: CoarseConfig,
+    measure: PerceptualDifference | None,
+) -> Iterator[_Arm]:
+    """The brief reconstructions, with arguments as `judge_finetuning`."""
+    settings = config.judge
+    frames = np.asarray(sequence.train, dtype=np.int64)
+    small = sequence.at_most_width(settings.max_width)
+    for part, left_out in _without_some_frames(small, frames, settings.leave_out_every):
         # Once for the brief reconstruction and all amounts.
-        weights_of_arms.append(frame_weights(part, part.train) if weighted else None)
+        weighted = coarse.inconsistent_frames == "weight"
+        weights = frame_weights(part, part.train) if weighted else None
         start = partial_scene(
             scene,
             replace(part, split=sequence.split),
@@ -205,60 +264,42 @@ def judge_finetuning(
             iterations=max(1, round(settings.iterations_share * coarse.iterations)),
             seed=config.seed,
             stage="finetune-judge",
-            frame_weights=weights_of_arms[-1],
+            frame_weights=weights,
         )
         views = None
         if enhancer is not None:
-            small = [cameras.at_most_width(settings.max_width) for cameras in trajectories]
-            views = _restored(start, part, small, enhancer, enhance, settings.views, measure)
-        arms.append((part, start, views))
-    if not arms:
-        return Judgement(1.0, "not judged: no training frame that can be left out has a valid pixel")
-    brief = config.model_copy(
-        update={"iterations": max(1, round(settings.iterations_share * config.iterations))}
-    )
-    before = [value for part, start, _ in arms for value in _psnr_db(start, part)]
+            smaller = [cameras.at_most_width(settings.max_width) for cameras in trajectories]
+            views = _restored(start, part, smaller, enhancer, enhance, settings.views, measure)
+        yield _Arm(part, left_out, start, views, weights)
 
-    tried: dict[float | None, list[Scene]] = {None: [start for _, start, _ in arms]}
 
-    def after_finetuning(amount: float) -> list[float]:
-        weight = {"pseudo_weight": amount * config.pseudo_weight} if amount > 0 else {}
-        after, tried[amount] = [], []
-        for (part, start, views), weights in zip(arms, weights_of_arms, strict=True):
-            pseudo_views = views if amount > 0 else None
-            found = finetune(
-                start,
-                part,
-                pseudo_views,
-                brief.model_copy(update=weight),
-                coarse,
-                stage="finetune-judge",
-                frame_weights=weights,
-            )
-            after += _psnr_db(found.scene, part)
-            tried[amount].append(found.scene)
-        return after
+def _finetuned(
+    arms: Sequence[_Arm], amount: float, config: FinetuneConfig, coarse: CoarseConfig
+) -> list[Scene]:
+    """The brief reconstructions after fine-tuning as brief, on real views alone for an amount of 0."""
+    changes: dict[str, float] = {
+        "iterations": max(1, round(config.judge.iterations_share * config.iterations))
+    }
+    if amount > 0:
+        changes["pseudo_weight"] = amount * config.pseudo_weight
+    brief = config.model_copy(update=changes)
+    return [
+        finetune(
+            arm.start,
+            arm.sequence,
+            arm.views if amount > 0 else None,
+            brief,
+            coarse,
+            stage="finetune-judge",
+            frame_weights=arm.frame_weights,
+        ).scene
+        for arm in arms
+    ]
 
-    control = after_finetuning(0.0)
-    trials = [_trial(0.0, before, control, control)]
-    if enhancer is not None:
-        for amount in AMOUNTS:
-            trials.append(_trial(amount, before, after_finetuning(amount), control))
-            if trials[-1].holds(settings.max_loss_db):
-                break
-    for trial in trials:
-        emit(MetricRecorded("finetune", f"left_out_gain_db_at_{trial.amount:g}", trial.gain_db))
-    judgement = decide(trials, settings.max_loss_db, np.sort(np.concatenate(left)))
-    if config.keep_scene:
-        judgement = replace(judgement, reason=f"{KEPT}; {judgement.reason}")
-    if enhancer is not None:
-        share = np.mean([_error_share(scene, sequence, start, part) for part, start, _ in arms])
-        parts = zip(arms, tried[judgement.amount], strict=True)
-        shown = ((start, render(final, part), part) for (part, start, _), final in parts)
-        shares = restored_shares(shown, enhancer, enhance, error_share=float(share))
-        judgement = replace(judgement, restored_shares=shares)
-    logger.info("finetune: %s", judgement.reason)
-    return judgement
+
+def _psnr_of_arms(arms: Sequence[_Arm], scenes: Sequence[Scene]) -> list[float]:
+    """PSNR of all frames left out, each in the scene that was made without it."""
+    return [value for arm, scene in zip(arms, scenes, strict=True) for value in _psnr_db(scene, arm.sequence)]
 
 
 def _without_some_frames(

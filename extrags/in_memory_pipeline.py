@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from extrags.config import PROFILES, PipelineConfig
+from extrags.config import DEFAULT_PROFILE, PROFILES, PipelineConfig
 from extrags.errors import CaptureError, ConfigError
 from extrags.pipeline import Pipeline
 from extrags.stages import StageName
@@ -478,7 +478,7 @@ def run_pipeline(
     from extrags.arguments import check_sequence_argument, check_settings_argument
 
     check_sequence_argument(sequence, "run_pipeline")
-    config = PROFILES["balanced"] if config is None else config
+    config = PROFILES[DEFAULT_PROFILE] if config is None else config
     check_settings_argument(config, PipelineConfig, "run_pipeline", 'extrags.PROFILES["quick"]')
     pipeline = InMemoryPipeline(sequence, config, leave_out, true_surface=true_surface)
     pipeline.run_stages(until)

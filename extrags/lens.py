@@ -318,7 +318,7 @@ class Undistortion:
         moved[~self.valid] = 0
         return np.asarray(moved)
 
-    def colour(self, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
+    def color(self, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
         """Colours, bilinear; black where nothing was seen."""
         import cv2
 

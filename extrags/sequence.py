@@ -316,7 +316,7 @@ class EndoscopicSequence(Storable):
         specular = None if self.specular is None else masks(~self.specular)
         return replace(
             self,
-            rgb=stacked((p.colour(image) for p, image in zip(plan, self.rgb, strict=True)), len(plan)),
+            rgb=stacked((p.color(image) for p, image in zip(plan, self.rgb, strict=True)), len(plan)),
             K=np.stack([p.K for p in plan]),
             mask=cast("np.ndarray", masks(self.mask)),
             depth_mm=depths(self.depth_mm),

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Int
 
 from extrags.cameras import Cameras
-from extrags.config import SurfaceConfig
+from extrags.config import DEFAULT_PROFILE, PROFILES, SurfaceConfig
 from extrags.errors import CaptureError, ShapeError
 from extrags.events import Progress, emit
 from extrags.frame_quantiles import quantile_of_frames
@@ -94,7 +94,7 @@ def fuse_surface(scene: Scene, cameras: Cameras, config: SurfaceConfig | None = 
     Args:
         scene: the reconstructed scene.
         cameras: the training views.
-        config: settings.
+        config: settings; None takes those of the profile `balanced`.
 
     Returns:
         The mesh in canonical order: the same inputs give the same bits.
@@ -102,7 +102,7 @@ def fuse_surface(scene: Scene, cameras: Cameras, config: SurfaceConfig | None = 
     Raises:
         CaptureError: when the views see no surface.
     """
-    config = SurfaceConfig() if config is None else config
+    config = PROFILES[DEFAULT_PROFILE].surface if config is None else config
     if not len(cameras):
         raise CaptureError("no views to fuse the surface from")
     views, depth = rendered_depth(scene, cameras, config)
@@ -145,7 +145,7 @@ def fuse_depth(cameras: Cameras, depth_mm: Float[np.ndarray, "c h w"], config: S
     Args:
         cameras: the views, at the size of the depth maps.
         depth_mm: z-depth in world units, 0 where unknown.
-        config: settings.
+        config: settings; None takes those of the profile `balanced`.
 
     Returns:
         The mesh, small clusters removed, in canonical order.

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from data_catalog.names import path_of
 from extrags import __version__
-from extrags.config import PipelineConfig
+from extrags.config import DEFAULT_PROFILE, PipelineConfig
 from extrags.errors import ConfigError, DamagedArtefactError, StoreError
 from extrags.stages import STAGES, StageName
 from extrags.store import Store, digest_of, read_records, write_record
@@ -59,7 +59,7 @@ class SequenceCase:
 
     sequence: str
     method: str = "extrags"
-    profile: str = "balanced"
+    profile: str = DEFAULT_PROFILE
     seed: int | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
     changed: Mapping[str, Any] = field(default_factory=dict)

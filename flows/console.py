@@ -30,10 +30,10 @@ def print_outcomes(run: DatasetOutcome, seconds: float) -> None:
             if state in states
         )
         coarse, final = (outcome.metrics.get(which) or {} for which in ("coarse", "final"))
-        colour = "green" if outcome.status == "ok" else "red"
+        color = "green" if outcome.status == "ok" else "red"
         table.add_row(
             escape(outcome.title),
-            f"[{colour}]{outcome.status}[/]",
+            f"[{color}]{outcome.status}[/]",
             counts,
             *(_change(name, coarse.get(name), final.get(name)) for name in columns),
         )

@@ -13,7 +13,7 @@ from prefect.artifacts import create_markdown_artifact
 from prefect.client.schemas.objects import State
 from pydantic import Field
 
-from extrags.config import ProfileName, Seed
+from extrags.config import DEFAULT_PROFILE, ProfileName, Seed
 from extrags.stages import StageName
 from extrags.store import Store
 from flows.cases import Only, SequenceCase, cases_of, record_outcome_quietly, selected
@@ -49,7 +49,7 @@ def reconstruct_dataset(
     sequences: Annotated[
         Sequences, Field(min_length=1, description="names, paths, patterns, or @FILE for a manifest")
     ],
-    profile: Annotated[ProfileName, Field(description="named settings")] = "balanced",
+    profile: Annotated[ProfileName, Field(description="named settings")] = DEFAULT_PROFILE,
     settings: Annotated[Settings, Field(description="overrides by dotted name")] = None,
     seed: Annotated[Seed | None, Field(description="seed of all stages")] = None,
     store: Annotated[

@@ -19,7 +19,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from extrags.config import profile_config
+from extrags.config import DEFAULT_PROFILE, profile_config
 from extrags.stages import StageName, stages_until
 from extrags.store import Store
 from flows.estimate import RunEstimate, expected_seconds
@@ -62,7 +62,7 @@ class RunInView:
 
     sequences: int = 0
     expected: Mapping[StageName, dict[str, float]] = field(
-        default_factory=lambda: expected_seconds(profile_config("balanced"))
+        default_factory=lambda: expected_seconds(profile_config(DEFAULT_PROFILE))
     )
     until: StageName = "report"
     store: str | None = None

@@ -10,7 +10,7 @@ from prefect.artifacts import create_markdown_artifact
 from pydantic import Field
 
 from data_catalog.names import plain_name
-from extrags.config import ProfileName, Seed
+from extrags.config import DEFAULT_PROFILE, ProfileName, Seed
 from extrags.stages import StageName
 from extrags.store import Store
 from extrags.store.runs import file_killed
@@ -40,7 +40,7 @@ def reconstruct_sequence(
     sequence: Annotated[
         str, Field(min_length=1, description="DATASET/SEQUENCE[@SETTING], or the path of a folder")
     ],
-    profile: Annotated[ProfileName, Field(description="named settings")] = "balanced",
+    profile: Annotated[ProfileName, Field(description="named settings")] = DEFAULT_PROFILE,
     settings: Annotated[Settings, Field(description='overrides such as {"coarse.iterations": 500}')] = None,
     seed: Annotated[Seed | None, Field(description="seed of all stages")] = None,
     store: Annotated[

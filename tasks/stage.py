@@ -155,6 +155,7 @@ def stage(
         if _versions.setdefault(name, version) != version:
             raise ConfigError(f"two versions of stage {name}: {_versions[name]} and {version}")
         key_of = StageKey(name=name, version=version, ignore=ignore)
+        signature = _own_signature(body)
 
         @functools.wraps(body)
         def run(
@@ -173,55 +174,11 @@ def stage(
             found = where.find_or_set_aside(key)
             if found is not None and not _refreshing():
                 return found
-            # Here, because it loads torch, which looking up an artefact must not.
-            from extrags.threads import kernel_threads, one_torch_thread
+            return _made(body, key_of, key, inputs, where, label, time_limit_s, threads)
 
-            # What a key ignores may be an artefact all the same: the lineage has it, the settings have not.
-            refs, settings = _split(
-                {
-                    name: value
-                    for name, value in inputs.items()
-                    if name not in ignore or isinstance(value, Ref)
-                }
-            )
-            with (
-                run_log(),
-                stage_page(),
-                reporting(label, name, time_limit_s),
-                where.slot(
-                    stage=name,
-                    version=version,
-                    key=key,
-                    label=label,
-                    config=settings,
-                    inputs=refs,
-                    renew=_refreshing(),
-                ) as slot,
-            ):
-                # Workers with other numbers of threads share the store.
-                with (
-                    peak_memory() as peak,
-                    spent_time() as spent,
-                    kernel_threads(threads),
-                    one_torch_thread(),
-                ):
-                    body(slot, **inputs)  # type: ignore[call-arg]
-                slot.counts["peak_mib"] = peak.mib
-                slot.counts.update(elapsed_s=spent.elapsed_s, processor_s=spent.processor_s)
-            return slot.ref
-
-        own = list(inspect.signature(body).parameters.values())[1:]
-        own = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in own]
-        signature = inspect.Signature(own)
-        given = [
-            inspect.Parameter("store", inspect.Parameter.KEYWORD_ONLY, annotation=str),
-            inspect.Parameter("label", inspect.Parameter.KEYWORD_ONLY, annotation=str, default=""),
-            inspect.Parameter(
-                "time_limit_s", inspect.Parameter.KEYWORD_ONLY, annotation=float | None, default=None
-            ),
-            inspect.Parameter("threads", inspect.Parameter.KEYWORD_ONLY, annotation=int | None, default=None),
-        ]
-        run.__signature__ = inspect.Signature([*own, *given], return_annotation=Ref)  # type: ignore[attr-defined]
+        run.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
+            [*signature.parameters.values(), *_PARAMETERS_OF_ALL], return_annotation=Ref
+        )
         return Task(
             fn=run,
             name=name,
@@ -234,6 +191,64 @@ def stage(
         )
 
     return decorate
+
+
+_PARAMETERS_OF_ALL = tuple(
+    inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, annotation=annotation, default=default)
+    for name, annotation, default in (
+        ("store", str, inspect.Parameter.empty),
+        ("label", str, ""),
+        ("time_limit_s", float | None, None),
+        ("threads", int | None, None),
+    )
+)
+"""What every stage takes beside its own arguments."""
+
+
+def _own_signature(body: Callable[..., None]) -> inspect.Signature:
+    """The arguments of a stage's function after the slot, by name alone."""
+    own = list(inspect.signature(body).parameters.values())[1:]
+    return inspect.Signature([parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in own])
+
+
+def _made(
+    body: Callable[..., None],
+    key_of: StageKey,
+    key: str,
+    inputs: dict[str, Any],
+    where: Store,
+    label: str,
+    time_limit_s: float | None,
+    threads: int | None,
+) -> Ref:
+    """Fill a new slot by a stage's function, and commit it."""
+    # Here, because it loads torch, which looking up an artefact must not.
+    from extrags.threads import kernel_threads, one_torch_thread
+
+    # What a key ignores may be an artefact all the same: the lineage has it, the settings have not.
+    refs, settings = _split(
+        {name: value for name, value in inputs.items() if name not in key_of.ignore or isinstance(value, Ref)}
+    )
+    with (
+        run_log(),
+        stage_page(),
+        reporting(label, key_of.name, time_limit_s),
+        where.slot(
+            stage=key_of.name,
+            version=key_of.version,
+            key=key,
+            label=label,
+            config=settings,
+            inputs=refs,
+            renew=_refreshing(),
+        ) as slot,
+    ):
+        # Workers with other numbers of threads share the store.
+        with peak_memory() as peak, spent_time() as spent, kernel_threads(threads), one_torch_thread():
+            body(slot, **inputs)
+        slot.counts["peak_mib"] = peak.mib
+        slot.counts.update(elapsed_s=spent.elapsed_s, processor_s=spent.processor_s)
+    return slot.ref
 
 
 def at(task: Task[..., Ref], store: str, *, refresh: bool = False) -> Task[..., Ref]:

@@ -97,7 +97,7 @@ def transforms_ascii(folder: Path) -> Path:
     write_transforms(sequence(), folder)
     rows = "".join(f"{x} {y} {z} 9 9 9\n" for x, y, z in np.asarray(sequence().points).tolist())
     columns = "".join(f"property double {axis}\n" for axis in "xyz")
-    columns += "".join(f"property uchar {colour}\n" for colour in ("red", "green", "blue"))
+    columns += "".join(f"property uchar {color}\n" for color in ("red", "green", "blue"))
     (folder / "points.ply").write_text(
         f"ply\nformat ascii 1.0\nelement vertex 6\n{columns}end_header\n{rows}"
     )
@@ -147,13 +147,13 @@ def dicom(folder: Path) -> Path:
 
 def dicom_jpeg(folder: Path) -> Path:
     """Frames of JPEG."""
-    return write_dicom(folder / "a.dcm", scene(), colours="YBR_FULL_422", jpeg=True, FrameTime=40)
+    return write_dicom(folder / "a.dcm", scene(), colors="YBR_FULL_422", jpeg=True, FrameTime=40)
 
 
 def dicom_video(folder: Path) -> Path:
     """A stream."""
     stream = write_video(folder / "a.mp4", scene(), "mp4v")
-    made = write_dicom(folder / "a.dcm", scene(), colours="YBR_PARTIAL_420", stream=stream.read_bytes())
+    made = write_dicom(folder / "a.dcm", scene(), colors="YBR_PARTIAL_420", stream=stream.read_bytes())
     stream.unlink()
     return made
 

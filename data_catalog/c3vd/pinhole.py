@@ -131,7 +131,7 @@ class PinholeResampling:
         areas = source_areas(self.centres[..., 0], self.centres[..., 1])
         return np.asarray(areas * self.inside / (self.camera.width * self.camera.height))
 
-    def colour(
+    def color(
         self, image: UInt8[np.ndarray, "h w 3"], *, file: object = None, frame: object = None
     ) -> UInt8[np.ndarray, "h2 w2 3"]:
         """Colours averaged over each new pixel's footprint; what lies outside the source repeats its edge.

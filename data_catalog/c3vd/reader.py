@@ -58,12 +58,12 @@ class _Part:
     def frames(self) -> list[PosedFrame]:
         """The frames, of a lens for images as large as the first."""
         video, folder = self.video, self.video.folder.resolve().name
-        first = video.colour_files[self.chosen[0]]
+        first = video.color_files[self.chosen[0]]
         camera = video.camera.scaled(*image_size(first, frame=video.numbers[self.chosen[0]]), file=first)
         return [
             PosedFrame(
                 name=f"{folder}_{video.numbers[index]:04d}",
-                file=video.colour_files[index],
+                file=video.color_files[index],
                 lens=camera,
                 world_from_camera=self.world_from_own @ video.world_from_camera[index],
                 depth_file=video.depth_files[index] if video.depth_files else None,

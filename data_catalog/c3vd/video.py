@@ -31,7 +31,7 @@ from jaxtyping import Float, UInt8
 from data_catalog.c3vd.published import find_recording, published_sets
 from data_catalog.c3vd.scaramuzza import CALIBRATIONS, CalibrationName, ScaramuzzaCamera, camera_from_json
 from data_catalog.checks import check_pose
-from data_catalog.images import read_colour, read_depth
+from data_catalog.images import read_color, read_depth
 from extrags.errors import PoseError, SourceError, SourceNotFoundError
 
 __all__ = [
@@ -70,7 +70,7 @@ class Video:
     Args:
         folder: where it lies.
         numbers: of its frames, as in the file names, ascending without a gap.
-        colour_files: one per frame.
+        color_files: one per frame.
         depth_files: one per frame, or empty where the video has no depth.
         world_from_camera: of each frame, in mm, [F, 4, 4].
         layout: how the numbers of a pose stand in pose.txt.
@@ -82,7 +82,7 @@ class Video:
 
     folder: Path
     numbers: tuple[int, ...]
-    colour_files: tuple[Path, ...]
+    color_files: tuple[Path, ...]
     depth_files: tuple[Path, ...]
     world_from_camera: Float[np.ndarray, "f 4 4"]
     layout: Layout
@@ -112,26 +112,26 @@ class Video:
             PoseError: see `read_pose_file`; or poses that do not fit the frames.
             SourceError: a calibration that makes no lens, or two files of one frame.
         """
-        colour = _numbered(folder / "rgb", _FOLDERED, "rgb")
+        color = _numbered(folder / "rgb", _FOLDERED, "rgb")
         depth_folder = folder / "depth"
-        flat = not colour
+        flat = not color
         if flat:
-            colour, depth_folder = _numbered(folder, _FLAT, "rgb"), folder
-        if not colour:
+            color, depth_folder = _numbered(folder, _FLAT, "rgb"), folder
+        if not color:
             raise SourceNotFoundError(
                 "no frame; expected rgb/NNNN.png (C3VDv2) or NNNN_color.png (C3VD)", file=folder, field="rgb"
             )
         depth = _numbered(depth_folder, _DEPTH, "depth")
-        numbers = tuple(sorted(colour))
+        numbers = tuple(sorted(color))
         missing = sorted(set(range(numbers[0], numbers[-1] + 1)) - set(numbers))
         if missing:
-            like = colour[numbers[0]].name.split("_")
+            like = color[numbers[0]].name.split("_")
             width = len(like[0].removesuffix(".png"))
             wanted = f"{missing[0]:0{width}d}{'_color' if flat else ''}.png"
             more = f", and {len(missing) - 1} more after it" if len(missing) > 1 else ""
             raise SourceNotFoundError(
                 f"no such file, though frames before and after it are there{more}",
-                file=colour[numbers[0]].with_name(wanted),
+                file=color[numbers[0]].with_name(wanted),
                 frame=missing[0],
                 field="rgb",
             )
@@ -156,7 +156,7 @@ class Video:
         return cls(
             folder=folder,
             numbers=numbers,
-            colour_files=tuple(colour[number] for number in numbers),
+            color_files=tuple(color[number] for number in numbers),
             depth_files=tuple(depth[number] for number in numbers) if depth else (),
             world_from_camera=_poses_of_frames(poses, numbers, pose_file),
             layout=layout,
@@ -169,9 +169,9 @@ class Video:
     def __len__(self) -> int:
         return len(self.numbers)
 
-    def colour(self, index: int) -> UInt8[np.ndarray, "h w 3"]:
+    def color(self, index: int) -> UInt8[np.ndarray, "h w 3"]:
         """The fisheye image of a frame, by position."""
-        return read_colour(self.colour_files[index], frame=self.numbers[index])
+        return read_color(self.color_files[index], frame=self.numbers[index])
 
     def depth_mm(self, index: int) -> Float[np.ndarray, "h w"]:
         """The fisheye's z-depth of a frame, by position; 0 where unknown.
@@ -189,7 +189,7 @@ class Video:
             for name in (POSE_FILE, "coverage_mesh.obj", CALIBRATION_FILE)
             if (self.folder / name).is_file()
         ]
-        frames = [self.colour_files[k] for k in chosen]
+        frames = [self.color_files[k] for k in chosen]
         return sorted([*fixed, *frames, *(self.depth_files[k] for k in chosen if self.depth_files)])
 
 

@@ -89,8 +89,8 @@ def ulcer(canvas: Canvas, palette: Palette) -> Material:
     """A fibrin coat: white to yellow, matt, with streaks of blood."""
     rng = canvas.rng
     coat = canvas.octaves((4.0, 2.0, 0.9, 0.4), (1.0, 1.0, 0.6, 0.35))
-    colour = palette.seen((0.78, 0.68, 0.44)) * np.exp(rng.normal(0, 0.1, 3)).astype(np.float32)
-    albedo = colour * np.exp(0.12 * coat[..., None])
+    color = palette.seen((0.78, 0.68, 0.44)) * np.exp(rng.normal(0, 0.1, 3)).astype(np.float32)
+    albedo = color * np.exp(0.12 * coat[..., None])
     blood = np.clip(canvas.octaves((3.0, 1.2), (1.0, 0.7)) - 1.3, 0, 1)[..., None]
     albedo = albedo * np.exp(-1.5 * blood * palette.absorbed)
     return canvas.packed(albedo, np.clip(0.4 + 0.2 * coat, 0.05, 1), coat, slope=rng.uniform(0.1, 0.3))
@@ -99,14 +99,14 @@ def ulcer(canvas: Canvas, palette: Palette) -> Material:
 def residue(canvas: Canvas, palette: Palette) -> Material:
     """Stool, bile or mucus: brown to yellow-green, lumpy or filmy, with bubbles in it."""
     rng = canvas.rng
-    colours = (
+    colors = (
         (0.34, 0.20, 0.06),
         (0.50, 0.36, 0.10),
         (0.44, 0.40, 0.14),
         (0.70, 0.66, 0.52),
         (0.60, 0.42, 0.2),
     )
-    base = palette.seen(colours[int(rng.integers(len(colours)))])
+    base = palette.seen(colors[int(rng.integers(len(colors)))])
     lumps = canvas.octaves((4.0, 1.8, 0.8, 0.35), (1.0, 0.8, 0.5, 0.3))
     albedo = base * np.exp(rng.uniform(0.05, 0.3) * lumps[..., None])
     wet, height = np.clip(0.9 + 0.3 * lumps, 0.1, 1.5), 0.1 * rng.uniform(0.2, 1.0) * lumps
@@ -126,8 +126,8 @@ def fat(canvas: Canvas, palette: Palette) -> Material:
     rng = canvas.rng
     relief, tone = canvas.cells(rng.uniform(2.0, 5.0))
     soft = canvas.octaves((2.5, 1.2, 0.5), (1.0, 0.6, 0.4))
-    colour = palette.seen((0.78, 0.58, 0.25)) * np.exp(rng.normal(0, 0.12, 3)).astype(np.float32)
-    albedo = colour * np.exp(0.06 * tone + 0.05 * soft)[..., None] * (0.88 + 0.16 * relief[..., None])
+    color = palette.seen((0.78, 0.58, 0.25)) * np.exp(rng.normal(0, 0.12, 3)).astype(np.float32)
+    albedo = color * np.exp(0.06 * tone + 0.05 * soft)[..., None] * (0.88 + 0.16 * relief[..., None])
     absorbed = rng.uniform(0.2, 0.9) * canvas.vessels("twigs") + rng.uniform(0, 0.5) * canvas.vessels("net")
     redness = np.clip(canvas.octaves((12.0, 5.0), (1.0, 1.0)) * 0.3 + rng.uniform(-0.3, 0.3), 0, 0.6)
     albedo = albedo * np.exp(-np.clip(absorbed + redness, 0, 1.3)[..., None] * palette.absorbed)
@@ -181,8 +181,8 @@ def metal(canvas: Canvas, palette: Palette) -> Material:
     brushed = canvas.noise(0.6, stretch=(1.0, 0.05))
     smear = canvas.octaves((6.0, 2.5), (1.0, 0.6))
     shade = canvas.rng.choice([0.03, 0.09, 0.18])
-    colour = palette.seen((1.0, 0.97, 0.95))
-    albedo = shade * np.exp(0.08 * brushed + 0.15 * smear)[..., None] * colour
+    color = palette.seen((1.0, 0.97, 0.95))
+    albedo = shade * np.exp(0.08 * brushed + 0.15 * smear)[..., None] * color
     return canvas.packed(albedo, np.clip(1.6 + 0.3 * smear, 0.6, 2.4), brushed, slope=0.03)
 
 

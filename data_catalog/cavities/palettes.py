@@ -41,12 +41,12 @@ class Palette:
     narrow_band: bool
 
     def seen(
-        self, colour: tuple[float, float, float] | Float[np.ndarray, "*s 3"]
+        self, color: tuple[float, float, float] | Float[np.ndarray, "*s 3"]
     ) -> Float[np.ndarray, "*s 3"]:
         """Colours of white light under this scene's light."""
-        red, green, blue = np.moveaxis(np.asarray(colour, dtype=np.float64), -1, 0)
+        red, green, blue = np.moveaxis(np.asarray(color, dtype=np.float64), -1, 0)
         if not self.narrow_band:
-            return np.array(colour, dtype=np.float32)
+            return np.array(color, dtype=np.float32)
         shown = (0.85 * green + 0.1 * red, 0.25 * green + 0.55 * blue, 0.2 * green + 0.55 * blue)
         return np.stack(shown, axis=-1).astype(np.float32)
 

@@ -46,7 +46,7 @@ class Processor:
         sharpening_px: its radius.
         defocus_px: standard deviation of the lens's blur.
         quality: of JPEG; 0 is none.
-        halved_colour: whether colour is stored at half the resolution.
+        halved_color: whether colour is stored at half the resolution.
         shake_px: length of the longest motion blur.
         interlace_px: how far the odd rows of a frame are behind; 0 is none.
         drift: standard deviation of the exposure's logarithm from frame to frame.
@@ -60,7 +60,7 @@ class Processor:
     sharpening_px: float
     defocus_px: float
     quality: int
-    halved_colour: bool
+    halved_color: bool
     shake_px: float
     interlace_px: int
     drift: float
@@ -77,7 +77,7 @@ class Processor:
             sharpening_px=float(rng.uniform(0.6, 1.4)),
             defocus_px=float(rng.uniform(0.1, 0.6)) if rng.random() < 0.85 else float(rng.uniform(0.6, 1.1)),
             quality=int(rng.integers(35, 93)) if rng.random() < 0.6 else 0,
-            halved_colour=bool(rng.random() < 0.7),
+            halved_color=bool(rng.random() < 0.7),
             shake_px=float(rng.uniform(0.5, 3.0)) if rng.random() < 0.3 else 0.0,
             interlace_px=int(rng.integers(1, 3)) if rng.random() < 0.04 else 0,
             drift=float(rng.choice([0.0, 0.015, 0.05])),
@@ -134,7 +134,7 @@ class Processor:
 
         factor = (
             cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420
-            if self.halved_colour
+            if self.halved_color
             else cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444
         )
         settings = [cv2.IMWRITE_JPEG_QUALITY, self.quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, factor]

@@ -34,7 +34,7 @@ _KIND = re.compile(
 """A word of a name that tells what a picture shows instead of colours."""
 _PERHAPS_KIND = re.compile(r"normals?|gt|groundtruth|flow|instances?|confidence|alpha")
 """A word that may as well be part of a recording's name, as of normal mucosa."""
-_COLOUR = re.compile(r"colou?rs?|rgb|bgr|images?|img|im|frames?|framebuffer|buffer|left|right")
+_COLOR = re.compile(r"colou?rs?|rgb|bgr|images?|img|im|frames?|framebuffer|buffer|left|right")
 """A word that tells nothing but that a picture is a frame."""
 
 _DEPTH_FOLDERS = ("depth", "depths", "gt_depth", "depth_gt", "disparity", "disparities")
@@ -69,14 +69,14 @@ def frames_among(files: Sequence[Path]) -> tuple[list[Path], list[Path]]:
     families: dict[tuple[str, ...], list[Path]] = {}
     for file, (pattern, _) in named.items():
         families.setdefault(pattern, []).append(file)
-    colour_words: dict[tuple[int, ...], list[frozenset[str]]] = {}
+    color_words: dict[tuple[int, ...], list[frozenset[str]]] = {}
     for _, (words, numbers) in named.values():
         if not _has(words, _KIND) and not _has(words, _PERHAPS_KIND):
-            telling = frozenset(word for word in words if not _COLOUR.fullmatch(word))
-            colour_words.setdefault(numbers, []).append(telling)
+            telling = frozenset(word for word in words if not _COLOR.fullmatch(word))
+            color_words.setdefault(numbers, []).append(telling)
     left_out: set[Path] = set()
     for members in families.values():
-        matched = sum(_belongs(*named[file][1], colour_words) for file in members)
+        matched = sum(_belongs(*named[file][1], color_words) for file in members)
         if matched and matched >= _MATCHED_SHARE * len(members):
             left_out.update(members)
     return [file for file in files if file not in left_out], [file for file in files if file in left_out]
@@ -91,10 +91,10 @@ def _parts(stem: str) -> tuple[tuple[str, ...], tuple[frozenset[str], tuple[int,
 
 
 def _belongs(
-    words: frozenset[str], numbers: tuple[int, ...], colour_words: dict[tuple[int, ...], list[frozenset[str]]]
+    words: frozenset[str], numbers: tuple[int, ...], color_words: dict[tuple[int, ...], list[frozenset[str]]]
 ) -> bool:
     """Whether a name says that it is the depth, mask, ... of a frame that is there."""
-    frames = colour_words.get(numbers, [])
+    frames = color_words.get(numbers, [])
     if _has(words, _KIND):
         return bool(frames)
     return _has(words, _PERHAPS_KIND) and any(frame <= words for frame in frames)

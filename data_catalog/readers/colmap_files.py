@@ -86,10 +86,10 @@ def read_model(folder: Path) -> ColmapModel:
             )
     if suffix == ".bin":
         lenses, rows = _binary_cameras(files[0]), _binary_images(files[1])
-        identifiers, points, colours = _binary_points(files[2])
+        identifiers, points, colors = _binary_points(files[2])
     else:
         lenses, rows = _text_cameras(files[0]), _text_images(files[1])
-        identifiers, points, colours = _text_points(files[2])
+        identifiers, points, colors = _text_points(files[2])
     order = np.argsort(identifiers)
     images = []
     for name, camera, quaternion, translation, pixels, observed in rows:
@@ -116,7 +116,7 @@ def read_model(folder: Path) -> ColmapModel:
         if image.name in seen:
             raise SourceError("the image is listed twice", file=files[1], frame=image.name, field="name")
         seen.add(image.name)
-    return ColmapModel(lenses, images, points, colours)
+    return ColmapModel(lenses, images, points, colors)
 
 
 def read_image_names(folder: Path) -> list[str]:
@@ -286,14 +286,14 @@ def _binary_points(
     stream = _Stream(file)
     count = stream.count("points", 51)
     identifiers = np.zeros(count, dtype=np.int64)
-    points, colours = np.zeros((count, 3)), np.zeros((count, 3), dtype=np.uint8)
+    points, colors = np.zeros((count, 3)), np.zeros((count, 3), dtype=np.uint8)
     for index in range(count):
         values = stream.take("Q3d3BdQ", f"point {index + 1}")
         if values[0] > _LARGEST:
             raise SourceError(f"point {index + 1}: {values[0]} is no identifier", file=file)
-        identifiers[index], points[index], colours[index] = values[0], values[1:4], values[4:7]
+        identifiers[index], points[index], colors[index] = values[0], values[1:4], values[4:7]
         stream.records(np.dtype("<u4"), 2 * int(values[8]), f"the track of point {index + 1}")
-    return identifiers, points, colours
+    return identifiers, points, colors
 
 
 def _lines(file: Path) -> Iterator[tuple[int, str]]:
@@ -361,7 +361,7 @@ def _text_images(file: Path) -> Iterator[_ImageRow]:
 def _text_points(
     file: Path,
 ) -> tuple[Int[np.ndarray, "p"], Float[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"]]:
-    identifiers, points, colours = [], [], []
+    identifiers, points, colors = [], [], []
     for number, line in _lines(file):
         words = line.split(maxsplit=8)
         if not words:
@@ -369,10 +369,10 @@ def _text_points(
         try:
             identifiers.append(int(words[0]))
             points.append([float(word) for word in words[1:4]])
-            colours.append([int(word) for word in words[4:7]])
-            if len(points[-1]) != 3 or len(colours[-1]) != 3:
+            colors.append([int(word) for word in words[4:7]])
+            if len(points[-1]) != 3 or len(colors[-1]) != 3:
                 raise ValueError(line)
-            if not (0 <= identifiers[-1] <= _LARGEST and all(0 <= value <= 255 for value in colours[-1])):
+            if not (0 <= identifiers[-1] <= _LARGEST and all(0 <= value <= 255 for value in colors[-1])):
                 raise ValueError(line)
         except ValueError as error:
             raise SourceError(
@@ -381,7 +381,7 @@ def _text_points(
     return (
         np.array(identifiers, dtype=np.int64),
         np.array(points, dtype=np.float64).reshape(-1, 3),
-        np.array(colours, dtype=np.uint8).reshape(-1, 3),
+        np.array(colors, dtype=np.uint8).reshape(-1, 3),
     )
 
 

@@ -33,7 +33,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from data_catalog.folder_reader import FolderReader
-from data_catalog.images import COLOUR_SUFFIXES, file_key, natural_key, order_for_fingerprint, save_images
+from data_catalog.images import COLOR_SUFFIXES, file_key, natural_key, order_for_fingerprint, save_images
 from data_catalog.inside import inside
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from data_catalog.readers.beside_frames import tell_about_folders
@@ -122,13 +122,13 @@ class _ImageFiles:
 
     Args:
         name: its path below the folder of the images.
-        colour: the image, which may be absent.
+        color: the image, which may be absent.
         mask: None where there is none.
         depth: None where there is none.
     """
 
     name: str
-    colour: Path
+    color: Path
     mask: Path | None
     depth: Path | None
 
@@ -146,16 +146,16 @@ def _located(folder: Path, names: list[str], pose_file: Path) -> tuple[Path, dic
     found: dict[str, _ImageFiles] = {}
     seen: set[Path] = set()
     for name in names:
-        colour = inside(root, name, file=pose_file, frame=name, field="name")
-        if colour in seen:
+        color = inside(root, name, file=pose_file, frame=name, field="name")
+        if color in seen:
             raise SourceError("the image is listed twice", file=pose_file, frame=name, field="name")
-        seen.add(colour)
+        seen.add(color)
         # Joined to another folder, an absolute name would lead back to the image itself.
-        below = colour.relative_to(root)
+        below = color.relative_to(root)
         found[name] = _ImageFiles(
             name=below.as_posix(),
-            colour=colour,
-            mask=masks.find(dict.fromkeys((below, below.parent / below.stem)), COLOUR_SUFFIXES),
+            color=color,
+            mask=masks.find(dict.fromkeys((below, below.parent / below.stem)), COLOR_SUFFIXES),
             depth=_depth_file(folder, below.as_posix()),
         )
     return root, found
@@ -175,7 +175,7 @@ def _files(folder: Path) -> list[Path]:
         model / f"{name}.{suffix}" for name in ("cameras", "images", "points3D") for suffix in ("bin", "txt")
     ]
     _, located = _located(folder, read_image_names(model), _pose_file(model))
-    of_images = [(item.colour, item.mask, item.depth) for item in located.values() if item.colour.is_file()]
+    of_images = [(item.color, item.mask, item.depth) for item in located.values() if item.color.is_file()]
     listed = [*fixed, *(file for files in of_images for file in files if file is not None)]
     return sorted({file for file in listed if file.is_file()})
 
@@ -194,7 +194,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     listed = sorted(model.images, key=lambda image: file_key(image.name))
     root, located = _located(folder, [image.name for image in listed], pose_file)
     _tell_about_unposed(root, {item.name for item in located.values()})
-    files = {name: item.colour for name, item in located.items()}
+    files = {name: item.color for name, item in located.items()}
     present = present_frames(files, config.max_absent_share, listing=pose_file)
     splits = _splits(folder, listed)
     images = [image for image in listed if image.name in present and (not splits or image.name in splits)]
@@ -205,7 +205,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     frames = [
         PosedFrame(
             name=item.name,
-            file=item.colour,
+            file=item.color,
             lens=model.lenses[image.camera],
             world_from_camera=image.world_from_camera,
             mask_file=item.mask,
@@ -274,7 +274,7 @@ def write_colmap(
         for number, row in enumerate(distinct, start=1)
     }
     located = np.zeros((0, 3)) if points is None else np.asarray(points, dtype=np.float64)
-    coloured = np.full((len(located), 3), 128, dtype=np.uint8) if points_rgb is None else points_rgb
+    colored = np.full((len(located), 3), 128, dtype=np.uint8) if points_rgb is None else points_rgb
     pixels, seen = _NO_OBSERVATIONS
     model = ColmapModel(
         lenses,
@@ -283,7 +283,7 @@ def write_colmap(
             for index, image in enumerate(names)
         ],
         located,
-        coloured,
+        colored,
     )
     write_model(model, folder / "sparse" / "0", binary=binary)
     for index, image in enumerate(names):
@@ -319,14 +319,14 @@ def points_of(
     pixels = len(sequence.train) * sequence.height * sequence.width
     stride = max(1, int(np.ceil(np.sqrt(pixels / at_most))))
     grid = np.s_[stride // 2 :: stride, stride // 2 :: stride]
-    located, coloured = [], []
+    located, colored = [], []
     for index in sequence.train.tolist():
         depth = sequence.depth_mm[index][grid]
         known = (depth > 0) & sequence.mask[index][grid]
         rays = pixel_rays(cameras[index])[0][grid][known]
         located.append(cameras.centers[index] + rays * depth[known][:, None].astype(np.float64))
-        coloured.append(sequence.rgb[index][grid][known])
-    return np.concatenate(located), np.concatenate(coloured)
+        colored.append(sequence.rgb[index][grid][known])
+    return np.concatenate(located), np.concatenate(colored)
 
 
 def read_depth_map(file: Path, *, frame: object = None) -> Float[np.ndarray, "h w"]:
@@ -417,7 +417,7 @@ def _tell_about_unposed(root: Path, posed: set[str]) -> None:
     present = {
         file.relative_to(root).as_posix()
         for file in root.rglob("*")
-        if file.suffix.lower() in COLOUR_SUFFIXES and file.is_file()
+        if file.suffix.lower() in COLOR_SUFFIXES and file.is_file()
     }
     unposed = sorted(present - posed, key=natural_key)
     if unposed and root.name in ("images", "rgb"):

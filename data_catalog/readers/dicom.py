@@ -64,7 +64,7 @@ _LOOKED_AT = (
     "CineRate",
     "RecommendedDisplayFrameRate",
 )
-_COLOURS = ("RGB", "YBR_FULL", "YBR_FULL_422", "MONOCHROME2")
+_COLORS = ("RGB", "YBR_FULL", "YBR_FULL_422", "MONOCHROME2")
 _USUAL_FRAMES_PER_S = 25.0
 _PIXEL_ELEMENT_BYTES = 12
 """Tag, representation and length of the pixel data, in all compressed syntaxes."""
@@ -94,10 +94,10 @@ class DicomFile:
             raise SourceError(
                 "a single frame; expected a multi-frame file", file=file, field="NumberOfFrames"
             )
-        colours = str(header.get("PhotometricInterpretation"))
-        if colours not in _COLOURS:
+        colors = str(header.get("PhotometricInterpretation"))
+        if colors not in _COLORS:
             raise SourceError(
-                f"{colours} is not understood; expected one of {', '.join(_COLOURS)}",
+                f"{colors} is not understood; expected one of {', '.join(_COLORS)}",
                 file=file,
                 field="PhotometricInterpretation",
             )

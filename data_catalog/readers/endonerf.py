@@ -37,7 +37,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from data_catalog.folder_reader import FolderReader
-from data_catalog.images import colour_files, order_for_fingerprint, read_colour, read_mask, spread
+from data_catalog.images import color_files, order_for_fingerprint, read_color, read_mask, spread
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from extrags.array_files import load_npy
 from extrags.config import IngestConfig
@@ -73,7 +73,7 @@ class MaskPolarity:
 
 def _part(folder: Path, names: tuple[str, ...]) -> list[Path]:
     found = next((folder / name for name in names if (folder / name).is_dir()), None)
-    return [] if found is None else colour_files(found)
+    return [] if found is None else color_files(found)
 
 
 def _not_read(folder: Path) -> list[str]:
@@ -83,7 +83,7 @@ def _not_read(folder: Path) -> list[str]:
         there = [folder / name for name in names if (folder / name).is_dir()]
         said += [f"{other.name}/ is not read, only {there[0].name}/" for other in there[1:]]
         place = next(iter(there), None)
-        if place is None or colour_files(place):
+        if place is None or color_files(place):
             continue
         others = sorted(file.name for file in place.iterdir() if file.is_file() and file.name[0] != ".")
         if others:
@@ -214,18 +214,18 @@ def mask_polarity(folder: Path) -> MaskPolarity:
     images = _part(folder, _IMAGE_FOLDERS)
     masks = _matching(_part(folder, _MASK_FOLDERS), images, "mask")
     looked_at = spread(len(images), _LOOKED_AT)
-    colours = [read_colour(images[k], frame=images[k].name) for k in looked_at]
+    colors = [read_color(images[k], frame=images[k].name) for k in looked_at]
     white = [read_mask(masks[k], frame=images[k].name) for k in looked_at]
-    for k, colour, mask in zip(looked_at, colours, white, strict=True):
-        if mask.shape != colour.shape[:2]:
+    for k, color, mask in zip(looked_at, colors, white, strict=True):
+        if mask.shape != color.shape[:2]:
             raise SourceError(
-                f"{mask.shape[1]} x {mask.shape[0]} pixels; expected {colour.shape[1]} x {colour.shape[0]} "
+                f"{mask.shape[1]} x {mask.shape[0]} pixels; expected {color.shape[1]} x {color.shape[0]} "
                 "as the image",
                 file=masks[k],
                 frame=images[k].name,
                 field="mask",
             )
-    return polarity_of_images(np.stack(colours), np.stack(white), file=masks[0].parent)
+    return polarity_of_images(np.stack(colors), np.stack(white), file=masks[0].parent)
 
 
 def polarity_of_images(

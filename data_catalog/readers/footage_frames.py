@@ -68,7 +68,7 @@ def footage_frames(footage: Footage, config: IngestConfig) -> SourceFrames:
     second = _SecondPass(footage, span, numbers, found.numbers[here], interlaced=shot.interlaced)
     unread = _unread(footage, config, numbers, found.width, found.height)
     # No more frames were chosen than may be kept, so that each is asked for, in order.
-    return replace(unread, read_colour=second.image, masks=second, looked_at=len(found))
+    return replace(unread, read_color=second.image, masks=second, looked_at=len(found))
 
 
 def footage_outline(footage: Footage, config: IngestConfig) -> SourceFrames:

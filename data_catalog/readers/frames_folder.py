@@ -35,7 +35,7 @@ from data_catalog.images import (
     image_entries,
     image_size,
     order_for_fingerprint,
-    read_colour,
+    read_color,
     spread,
 )
 from data_catalog.interlacing import is_combed, is_interlaced
@@ -191,7 +191,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
         frames=[PosedFrame(file.name, file, lens, mask_file=mask_file) for file in files],
         pose_file=folder,
         metric=False,
-        read_colour=_Images(folder, [files[k] for k in spread(len(files), config.max_frames)]).image,
+        read_color=_Images(folder, [files[k] for k in spread(len(files), config.max_frames)]).image,
         masks=_ContentMask(),
         intrinsics=stated_intrinsics(folder, config),
     )
@@ -213,7 +213,7 @@ class _Images:
 
     def image(self, frame: PosedFrame) -> UInt8[np.ndarray, "h w 3"]:
         """The image of the next frame, as it lies on disk."""
-        image = read_colour(frame.file, frame=frame.label)
+        image = read_color(frame.file, frame=frame.label)
         if frame.file in self._looked_at:
             self._combed.append(is_combed(image))
         if frame.file == self._last and is_interlaced(self._combed):

@@ -46,9 +46,9 @@ from typing import Any
 from data_catalog.checks import check_intrinsics
 from data_catalog.folder_reader import FolderReader
 from data_catalog.images import (
-    COLOUR_SUFFIXES,
+    COLOR_SUFFIXES,
     DEPTH_SUFFIXES,
-    colour_files,
+    color_files,
     depth_suffixes_in_words,
     image_size,
 )
@@ -85,7 +85,7 @@ def _files(folder: Path) -> list[Path]:
     content = _load(folder)
     # Absent images are refused on reading; nothing is read beside them.
     names = [entry["file"] for entry in content["frames"] if (folder / entry["file"]).is_file()]
-    beside = _beside(folder, "depth", names, DEPTH_SUFFIXES) + _beside(folder, "mask", names, COLOUR_SUFFIXES)
+    beside = _beside(folder, "depth", names, DEPTH_SUFFIXES) + _beside(folder, "mask", names, COLOR_SUFFIXES)
     found = {folder / POSES_FILE, *(folder / name for name in names), *(file for file in beside if file)}
     return sorted(found)
 
@@ -167,7 +167,7 @@ def _check_count(folder: Path, frames: list[dict[str, Any]]) -> None:
                 field="file",
             )
     images = folder / "rgb"
-    present = [f"rgb/{file.name}" for file in colour_files(images)] if images.is_dir() else []
+    present = [f"rgb/{file.name}" for file in color_files(images)] if images.is_dir() else []
     extra = [name for name in present if name not in set(listed)]
     if extra:
         raise PoseError(
@@ -238,7 +238,7 @@ def _mask_files(folder: Path, names: list[str]) -> list[Path | None]:
     if not (folder / "mask").is_dir():
         tell_about_folders(folder, "mask", "masks are looked for in mask/")
         return [None] * len(names)
-    found = _beside(folder, "mask", names, COLOUR_SUFFIXES)
+    found = _beside(folder, "mask", names, COLOR_SUFFIXES)
     warn_of_unmasked(folder / "mask", dict(zip(names, found, strict=True)))
     return found
 

@@ -33,7 +33,7 @@ from jaxtyping import Float, UInt8
 
 from data_catalog.folder_reader import FolderReader
 from data_catalog.images import (
-    COLOUR_SUFFIXES,
+    COLOR_SUFFIXES,
     file_key,
     image_entries,
     image_size,
@@ -252,9 +252,9 @@ def write_transforms(
 
 def _with_suffix(file: Path) -> Path:
     """The image a path means: the synthetic NeRF scenes leave `.png` out."""
-    if file.is_file() or file.suffix.lower() in COLOUR_SUFFIXES:
+    if file.is_file() or file.suffix.lower() in COLOR_SUFFIXES:
         return file
-    candidates = (file.with_name(file.name + suffix) for suffix in COLOUR_SUFFIXES)
+    candidates = (file.with_name(file.name + suffix) for suffix in COLOR_SUFFIXES)
     return next((candidate for candidate in candidates if candidate.is_file()), file)
 
 
@@ -441,10 +441,10 @@ def _points(
     names = set(vertices.dtype.names or ())
     if not {"red", "green", "blue"} <= names:
         return located[finite], None
-    coloured = [vertices[name] for name in ("red", "green", "blue")]
-    if any(values.dtype.kind not in "fiu" for values in coloured):
+    colored = [vertices[name] for name in ("red", "green", "blue")]
+    if any(values.dtype.kind not in "fiu" for values in colored):
         raise SourceError("colours are not numbers", file=place, field="ply_file_path")
-    shades = np.nan_to_num(np.stack(coloured, axis=1)[finite]).clip(0, 255).astype(np.uint8)
+    shades = np.nan_to_num(np.stack(colored, axis=1)[finite]).clip(0, 255).astype(np.uint8)
     return located[finite], shades
 
 
@@ -460,6 +460,6 @@ def _write_points(
     for index, axis in enumerate("xyz"):
         rows[axis] = points[:, index]
     if points_rgb is not None:
-        for index, colour in enumerate(("red", "green", "blue")):
-            rows[colour] = points_rgb[:, index]
+        for index, color in enumerate(("red", "green", "blue")):
+            rows[color] = points_rgb[:, index]
     PlyData([PlyElement.describe(rows, "vertex")]).write(str(file))

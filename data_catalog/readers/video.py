@@ -50,7 +50,7 @@ _COUNTS_WHAT_IS_HIDDEN = "mp4"
 """Of the containers, this family alone: it counts frames that an edit list leaves out, as those between the
 last key frame and the beginning of a part that was cut out without coding it anew. Its durations are those of
 what is shown, and of a header that a truncated file has whole or not at all."""
-_UNSPECIFIED_COLOUR = 2
+_UNSPECIFIED_COLOR = 2
 """What FFmpeg says of a matrix of colours that the file does not name."""
 _HIGH_DEFINITION_PX = (1280, 577)
 """From so many columns, or rows, players take such a matrix for BT.709, below for BT.601."""
@@ -148,7 +148,7 @@ class VideoFile:
                 if time_s >= span.end_s or (last is not None and number > last):
                     return
                 if time_s in span and (numbers is None or number in numbers):
-                    rgb = np.rot90(_colours(frame), self._quarter_turns)
+                    rgb = np.rot90(_colors(frame), self._quarter_turns)
                     yield FootageFrame(number, time_s, np.ascontiguousarray(rgb))
         if numbers is None:
             self._check_whole(count, time_s)
@@ -289,12 +289,12 @@ def _is_cover(stream: Any) -> bool:
     return bool(stream.disposition & Disposition.attached_pic)
 
 
-def _colours(frame: Any) -> UInt8[np.ndarray, "h w 3"]:
+def _colors(frame: Any) -> UInt8[np.ndarray, "h w 3"]:
     """A decoded frame as RGB, by the matrix that the file names, else by the one that players take."""
     from av.video.reformatter import Colorspace, Interpolation
 
     large = frame.width >= _HIGH_DEFINITION_PX[0] or frame.height >= _HIGH_DEFINITION_PX[1]
-    guessed = Colorspace.ITU709 if large and frame.colorspace == _UNSPECIFIED_COLOUR else None
+    guessed = Colorspace.ITU709 if large and frame.colorspace == _UNSPECIFIED_COLOR else None
     # Of most sizes FFmpeg otherwise takes tables that round down and repeat each chrominance twice, and what
     # they give is up to 1.5/255 too dark on average, of 10 bits 2/255. Rounding without interpolating
     # chrominance makes it worse.

@@ -11,9 +11,12 @@ from extrags.config.restorer import EnhanceConfig
 from extrags.config.stages import EvaluateConfig, FinetuneConfig, IngestConfig, PipelineConfig
 from extrags.errors import ConfigError
 
-__all__ = ["PROFILES", "ProfileName", "profile_config"]
+__all__ = ["DEFAULT_PROFILE", "PROFILES", "ProfileName", "profile_config"]
 
 ProfileName = Literal["quick", "balanced", "paper"]
+
+DEFAULT_PROFILE: ProfileName = "balanced"
+"""Whose settings a run has that is given none, and a stage that is called alone without any."""
 
 PROFILES: dict[str, PipelineConfig] = {
     # A preview in about three minutes on two cores.

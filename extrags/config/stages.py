@@ -277,7 +277,8 @@ class ReportConfig(StageConfig):
 class PipelineConfig(StageConfig):
     """All stages of one run.
 
-    The defaults of its fields are no profile: what is run without settings is `PROFILES["balanced"]`.
+    The defaults of its fields are no profile: what is called without settings takes those of
+    `DEFAULT_PROFILE`.
     """
 
     not_in_keys: ClassVar[frozenset[str]] = frozenset({"device"})

@@ -13,13 +13,14 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 from torch.nn import functional
 
-from extrags.config import PosesConfig
+from extrags.config import DEFAULT_PROFILE, PROFILES, PosesConfig
 from extrags.config.depth import DepthConfig
 from extrags.depth.completion import CompletionNetwork, completion_inputs
 from extrags.depth.edges import sharpened
 from extrags.depth.frames import PosedFrames, select_sources
 from extrags.depth.monocular import MonocularPredictor, predictions
 from extrags.depth.monocular_network import load_monocular
+from extrags.depth.report import depth_report
 from extrags.depth.stereo import (
     SECOND_SWEEP,
     THIRD_SWEEP,
@@ -29,7 +30,7 @@ from extrags.depth.stereo import (
     sweep_around,
 )
 from extrags.depth.unmatched import scale_error, unmatched_frames
-from extrags.depth.weights import BUNDLED, NONE, completion_digest, load_completion
+from extrags.depth.weights import NONE, load_completion
 from extrags.devices import chosen_device
 from extrags.errors import CaptureError
 from extrags.events import Progress, emit
@@ -140,8 +141,9 @@ def estimate_depth(
 
     Args:
         sequence: with poses.
-        config: what to use; None takes the defaults.
-        poses: settings of the features that points are triangulated from; None takes the defaults.
+        config: what to use; None takes those of the profile `balanced`.
+        poses: settings of the features that points are triangulated from; None takes those of the profile
+            `balanced`.
         monocular: a network of the caller's own; None loads that of the settings, if they name one.
         stage: named in progress events.
 
@@ -152,7 +154,7 @@ def estimate_depth(
         WeightsError: when the weights of a network cannot be read.
         MissingDependencyError: when a monocular network is asked for without the package it needs.
     """
-    config = DepthConfig() if config is None else config
+    config = PROFILES[DEFAULT_PROFILE].depth if config is None else config
     if sequence.lens is not None:
         flat = sequence.as_pinhole(WIDE_FIELD_DEG)
         return _through_lens(
@@ -161,6 +163,7 @@ def estimate_depth(
     device = chosen_device(config.device, "depth.device")
     if len(sequence) < 2:
         raise CaptureError(f"{sequence.name}: depth from other frames needs at least two, found one")
+    poses = PROFILES[DEFAULT_PROFILE].poses if poses is None else poses
     points, points_rgb, origin = _points(sequence, config, poses)
     small = sequence.at_most_width(config.max_width)
     near, typical, far = _ranges(small, points, config)
@@ -195,41 +198,20 @@ def estimate_depth(
             log_depth, error, stereo = _completed(network, frames, small, stereo, config, settings, told)
         log_depth = sharpened(log_depth, error, frames)
     depth, expected = _at_full_size(sequence, frames.mask, log_depth, error)
-    confirmed = (stereo.agrees * stereo.seen > 0) & frames.mask
-    median = median_of_frames(
-        lambda: (image[mask] for image, mask in zip(expected, sequence.mask, strict=True))
-    )
     report: dict[str, Any] = {
         "points_from": origin,
         "n_points": len(points),
-        "sources_median": float(stereo.n_sources.median()),
-        "frames_alone": int(unmatched_frames(stereo, frames.mask).sum()),
-        "agreeing_share": float(confirmed.sum() / frames.mask.sum().clamp_min(1)),
-        "shading": [
-            {
-                "slope": fit.slope,
-                "scatter": min(fit.scatter, 9.0),
-                "spread": min(fit.spread, 9.0),
-                "pixels": fit.n_pixels,
-            }
-            for fit in stereo.fits
-        ],
-        "monocular": [
-            {
-                "scatter": min(float(fit.scatter.min()), 9.0),
-                "frames_aligned": int(fit.own.sum()),
-                "pixels": fit.n_pixels,
-            }
-            for fit in stereo.monocular
-        ],
-        # Never a path: the same weights elsewhere make the same artefact.
-        "completion": config.completion
-        if config.completion in (BUNDLED, NONE)
-        else f"weights {completion_digest(config.completion)}",
+        **depth_report(stereo, frames.mask, config.completion),
         "device": device.type,
-        "median_expected_error": 1.0 if median is None else median,
+        "median_expected_error": _median_error(expected, sequence.mask),
     }
     return DepthEstimate(depth, expected, points.astype(np.float64), points_rgb, report)
+
+
+def _median_error(expected: Float[np.ndarray, "f h w"], mask: Bool[np.ndarray, "f h w"]) -> float:
+    """Expected error of the pixels in the mask, in the median; 1 where there are none."""
+    found = median_of_frames(lambda: (image[inside] for image, inside in zip(expected, mask, strict=True)))
+    return 1.0 if found is None else found
 
 
 def _through_lens(
@@ -299,7 +281,7 @@ def posed_frames(sequence: EndoscopicSequence, device: torch.device | str = "cpu
 
 
 def _points(
-    sequence: EndoscopicSequence, config: DepthConfig, poses: PosesConfig | None
+    sequence: EndoscopicSequence, config: DepthConfig, poses: PosesConfig
 ) -> tuple[np.ndarray, np.ndarray, str]:
     """Sparse points, their colours, and where they come from."""
     if sequence.points is not None and len(sequence.points) >= MIN_POINTS:

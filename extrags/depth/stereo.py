@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import TypedDict
+from dataclasses import dataclass, fields, replace
+from typing import Any, TypedDict
 
-import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn import functional
 
-from extrags.depth import matching, native
-from extrags.depth.consistency import agreement
+from extrags.depth.consistency import Agreement, agreement
+from extrags.depth.cues import fitted_cues
 from extrags.depth.frames import PosedFrames
-from extrags.depth.monocular import MonocularFit, aligned, fit_monocular
-from extrags.depth.prior import DepthPrior
-from extrags.depth.shading import ShadingFit, fit_shading, smoothed_brightness
+from extrags.depth.monocular import MonocularFit
+from extrags.depth.shading import ShadingFit
+from extrags.depth.sweeps import (
+    Planes,
+    StereoSettings,
+    best_around,
+    first_sweep,
+    frame_parts,
+    second_sweep,
+    source_counts,
+)
 from extrags.errors import ShapeError
-from extrags.frame_stacks import empty_stack
 
 __all__ = [
     "SECOND_SWEEP",
@@ -35,15 +40,8 @@ NEARLY_SATURATED = 0.97
 of `extrags.thresholds.SATURATED`: frames are made smaller before they are matched, which mixes saturated
 pixels with their neighbours."""
 
-COST_LEVELS = 127.5
-"""Levels per unit of the costs that are kept as bytes."""
-
 SURE_AGREEMENT = 1.5
 """Sources that must agree with a depth for the fit of other cues, together with the frame's own."""
-
-CHUNK_VALUES = 1 << 26
-"""Costs of as many frames as have so many are made at a time on a GPU, which single frames leave idle; with
-what is made on the way that is about 2 GB."""
 
 
 class SweepAround(TypedDict):
@@ -60,41 +58,6 @@ SECOND_SWEEP = SweepAround(half_width=0.2, hypotheses=17, small_step=0.1, jump=0
 
 THIRD_SWEEP = SweepAround(half_width=0.1, hypotheses=13, small_step=0.2, jump=1.0)
 """After the second completion; its result is mixed with it."""
-
-
-@dataclass(frozen=True)
-class StereoSettings:
-    """How stereo searches.
-
-    Args:
-        hypotheses: depths of the first sweep, evenly spaced in log-depth.
-        radius_px: windows have sides of 2 radius + 1 pixels.
-        best_share: share of the sources, those that match best, whose costs are averaged.
-        small_step: semi-global penalty of a change by one hypothesis.
-        jump: semi-global penalty of larger changes.
-        shading: whether what brightness predicts is part of the prior.
-        prior_weight: weight of the prior that other cues give; it is bounded, so that clear matches win.
-        prior_scatters: scatters of the cues at which the prior reaches its weight.
-        refinement_hypotheses: depths of the second sweep, around the surface that the first one found.
-        refinement_extent: half the width of the second sweep, in steps of the first.
-        refinement_small_step: as `small_step`, in the second sweep.
-        refinement_jump: as `jump`, in the second sweep.
-        tolerance: log-ratio up to which depths of two frames agree.
-    """
-
-    hypotheses: int = 96
-    radius_px: int = 3
-    best_share: float = 0.5
-    small_step: float = 0.15
-    jump: float = 1.5
-    shading: bool = True
-    prior_weight: float = 0.2
-    prior_scatters: float = 4.0
-    refinement_hypotheses: int = 13
-    refinement_extent: float = 3.0
-    refinement_small_step: float = 0.1
-    refinement_jump: float = 0.5
-    tolerance: float = 0.05
 
 
 @dataclass(frozen=True)
@@ -186,93 +149,33 @@ def multi_view_stereo(
     if min(frames.size) < 2:
         height, width = frames.size
         raise ShapeError(f"images of {width}x{height} pixels are too small for stereo; expected 2x2 or more")
-    device, n = frames.rgb.device, len(frames)
-    recording = torch.zeros(n, dtype=torch.long, device=device) if recording is None else recording
-    grey, brightness = frames.grey, smoothed_brightness(frames)
-    steps = torch.linspace(-1, 1, settings.hypotheses, device=device)
-    log_base = 0.5 * (near.log() + far.log())
-    offsets = 0.5 * (far.log() - near.log())[:, None] * steps[None]
-    parts = _parts(frames, settings.hypotheses, chunk)
-    kernels = native if device.type == "cpu" else matching
-    # Costs of all frames are kept for the prior, which needs depth of all: as bytes, in a mapped file.
-    shape = (n, settings.hypotheses, *frames.size)
-    costs, first = torch.from_numpy(empty_stack(shape, np.uint8)), []
-    for part in parts:
-        base = log_base[part].exp()[:, None, None].expand(-1, *frames.size)
-        cost = _cost(frames, part, sources, base, offsets[part], settings)
-        # A byte is fine enough for what is only ranked again.
-        costs[part.cpu()] = (cost * COST_LEVELS).round().clamp(0, 255).to(torch.uint8).cpu()
-        position, _, _ = kernels.best_steps(
-            cost, grey[part], small_step=settings.small_step, jump=settings.jump
-        )
-        first.append(_log_depth(position, log_base[part][:, None, None], offsets[part]))
-        if told is not None:
-            told(len(part))
-    depth = torch.cat(first).exp()
-    agreed = [agreement(frames, depth, part, sources[part], tolerance=settings.tolerance) for part in parts]
-    count = (sources >= 0).sum(1)
-    sure = torch.cat([a.agrees * a.seen for a in agreed]) * count[:, None, None] >= SURE_AGREEMENT
-    sure &= frames.mask & (frames.rgb.amax(dim=1) < NEARLY_SATURATED)
-    fits = fit_shading(brightness, depth.log(), sure, recording)
-    prior, monocular_fits = shading_prior(fits, brightness, recording), []
-    if not settings.shading:
-        # Not only without weight: what completes stereo would look at it.
-        prior = DepthPrior(prior.log_depth, torch.full_like(prior.scatter, torch.inf))
-    if monocular is not None:
-        monocular_fits = fit_monocular(monocular, depth.log(), sure, recording)
-        other = DepthPrior(*aligned(monocular_fits, monocular, recording))
-        prior = prior & other if settings.shading else other
-    prior_weight = settings.prior_weight if settings.shading or monocular is not None else 0.0
-    found, matched, margins = [], [], []
-    for part in parts:
-        cost = costs[part.cpu()].to(device).float() / COST_LEVELS
-        cost += prior.cost(
-            part, log_base[part], offsets[part], weight=prior_weight, scatters=settings.prior_scatters
-        )
-        position, _, margin = kernels.best_steps(
-            cost, grey[part], small_step=settings.small_step, jump=settings.jump
-        )
-        margins.append(margin)
-        unpredicted = ~torch.isfinite(prior.scatter[part]) if prior_weight > 0 else True
-        blind = (count[part] == 0) & unpredicted
-        position = _undecided(position, settings.hypotheses, blind)
-        log_depth = _log_depth(position, log_base[part][:, None, None], offsets[part])
-        surface = _median(log_depth, frames.mask[part])
-        step = offsets[part][:, 1] - offsets[part][:, 0]
-        finer = torch.linspace(-1, 1, settings.refinement_hypotheses, device=device)[None]
-        finer = finer * (settings.refinement_extent * step)[:, None]
-        cost = _cost(frames, part, sources, surface.exp(), finer, settings)
-        position, _, _ = kernels.best_steps(
-            cost, grey[part], small_step=settings.refinement_small_step, jump=settings.refinement_jump
-        )
-        position = _undecided(position, finer.shape[1], count[part] == 0)
-        found.append(_log_depth(position, surface, finer))
-        nearest = position.round().long().clamp(0, finer.shape[1] - 1)
-        matched.append(cost.gather(1, nearest[:, None])[:, 0])
-        if told is not None:
-            told(len(part))
-    log_depth = torch.cat(found)
-    depth = torch.where(frames.mask, log_depth.exp(), 0.0)
-    agreed = [agreement(frames, depth, part, sources[part], tolerance=settings.tolerance) for part in parts]
-
-    def joined(name: str) -> Tensor:
-        return torch.cat([getattr(a, name) for a in agreed])
-
+    if recording is None:
+        recording = torch.zeros(len(frames), dtype=torch.long, device=frames.rgb.device)
+    planes = Planes.between(near, far, settings.hypotheses)
+    parts = frame_parts(frames, settings.hypotheses, chunk)
+    costs, first = first_sweep(frames, sources, planes, parts, settings, told)
+    depth = first.exp()
+    cues = fitted_cues(
+        frames,
+        depth,
+        _sure(frames, sources, depth, parts, settings),
+        recording,
+        shading=settings.shading,
+        monocular=monocular,
+        weight=settings.prior_weight,
+    )
+    log_depth, cost, margin = second_sweep(frames, sources, planes, costs, cues, parts, settings, told)
     return StereoDepth(
         log_depth=log_depth,
-        cost=torch.cat(matched),
-        margin=torch.cat(margins),
-        seen=joined("seen"),
-        agrees=joined("agrees"),
-        violates=joined("violates"),
-        difference=joined("difference"),
-        fused=joined("fused"),
-        prior=prior.log_depth,
-        prior_scatter=prior.scatter,
-        fits=fits,
-        monocular=monocular_fits,
+        cost=cost,
+        margin=margin,
+        **_agreement_of_all(frames, sources, log_depth, parts, settings),
+        prior=cues.prior.log_depth,
+        prior_scatter=cues.prior.scatter,
+        fits=cues.shading,
+        monocular=cues.monocular,
         recording=recording,
-        n_sources=count,
+        n_sources=source_counts(sources),
     )
 
 
@@ -309,94 +212,52 @@ def sweep_around(
         told: called with the number of frames done.
     """
     settings = StereoSettings() if settings is None else settings
-    kernels = native if log_depth.device.type == "cpu" else matching
-    grey = frames.grey
     offsets = torch.linspace(-half_width, half_width, hypotheses, device=log_depth.device)[None]
     found, matched = [], []
-    count = (sources >= 0).sum(1)
-    parts = _parts(frames, hypotheses, chunk)
+    parts = frame_parts(frames, hypotheses, chunk)
     for part in parts:
         around = offsets.expand(len(part), -1)
-        cost = _cost(frames, part, sources, log_depth[part].exp(), around, settings)
-        position, _, _ = kernels.best_steps(cost, grey[part], small_step=small_step, jump=jump)
-        position = _undecided(position, hypotheses, count[part] == 0)
-        found.append(_log_depth(position, log_depth[part], around))
-        nearest = position.round().long().clamp(0, hypotheses - 1)
-        matched.append(cost.gather(1, nearest[:, None])[:, 0])
+        own_log_depth, own_cost = best_around(
+            frames, part, sources, log_depth[part], around, settings, small_step=small_step, jump=jump
+        )
+        found.append(own_log_depth)
+        matched.append(own_cost)
         if told is not None:
             told(len(part))
     new = torch.cat(found)
-    depth = torch.where(frames.mask, new.exp(), 0.0)
-    agreed = [agreement(frames, depth, part, sources[part], tolerance=settings.tolerance) for part in parts]
     return replace(
         stereo,
         log_depth=new,
         cost=torch.cat(matched),
-        n_sources=count,
-        seen=torch.cat([a.seen for a in agreed]),
-        agrees=torch.cat([a.agrees for a in agreed]),
-        violates=torch.cat([a.violates for a in agreed]),
-        difference=torch.cat([a.difference for a in agreed]),
-        fused=torch.cat([a.fused for a in agreed]),
+        n_sources=source_counts(sources),
+        **_agreement_of_all(frames, sources, new, parts, settings),
     )
 
 
-def shading_prior(
-    fits: list[ShadingFit], brightness: Float[Tensor, "f h w"], recording: Int[Tensor, "f"]
-) -> DepthPrior:
-    """What brightness predicts of all frames, by their recordings' fits."""
-    log_depth = torch.empty_like(brightness)
-    for g, fit in enumerate(fits):
-        log_depth[recording == g] = fit.log_depth(brightness[recording == g])
-    scatter = torch.tensor([fit.scatter for fit in fits], device=brightness.device)[recording]
-    return DepthPrior(log_depth, scatter)
-
-
-def _parts(frames: PosedFrames, hypotheses: int, chunk: int | None) -> tuple[Tensor, ...]:
-    """Numbers of the frames that are matched together."""
-    device = frames.rgb.device
-    if chunk is None:
-        height, width = frames.size
-        chunk = 1 if device.type == "cpu" else max(1, CHUNK_VALUES // (hypotheses * height * width))
-    parts: tuple[Tensor, ...] = torch.arange(len(frames), device=device).split(chunk)
-    return parts
-
-
-def _cost(
+def _sure(
     frames: PosedFrames,
-    part: Tensor,
     sources: Tensor,
-    base: Tensor,
-    offsets: Tensor,
+    depth: Float[Tensor, "f h w"],
+    parts: tuple[Tensor, ...],
     settings: StereoSettings,
-) -> Tensor:
-    kernels = native if base.device.type == "cpu" else matching
-    cost: Tensor = kernels.matching_cost(
-        frames,
-        part,
-        sources[part],
-        base,
-        offsets,
-        radius_px=settings.radius_px,
-        best_share=settings.best_share,
-    )
-    return cost
+) -> Bool[Tensor, "f h w"]:
+    """Pixels whose depth enough sources share for other cues to be fitted to it."""
+    agreed = [agreement(frames, depth, part, sources[part], tolerance=settings.tolerance) for part in parts]
+    agreeing = torch.cat([a.agrees * a.seen for a in agreed]) * source_counts(sources)[:, None, None]
+    sure = agreeing >= SURE_AGREEMENT
+    return sure & frames.mask & (frames.rgb.amax(dim=1) < NEARLY_SATURATED)
 
 
-def _log_depth(position: Tensor, log_base: Tensor, offsets: Tensor) -> Tensor:
-    step = (offsets[:, 1] - offsets[:, 0])[:, None, None]
-    return log_base + offsets[:, 0, None, None] + position * step
-
-
-def _undecided(position: Tensor, hypotheses: int, blind: Tensor) -> Tensor:
-    """The middle of the range for frames that nothing speaks for: of equal costs the first would win."""
-    return torch.where(blind[:, None, None], 0.5 * (hypotheses - 1), position)
-
-
-def _median(log_depth: Tensor, mask: Tensor) -> Tensor:
-    """Median over 5 x 5 pixels inside the mask: steps and single outliers go, edges stay."""
-    value = torch.where(mask, log_depth, float("nan"))
-    padded = functional.pad(value[:, None], (2, 2, 2, 2), value=float("nan"))[:, 0]
-    windows = padded.unfold(1, 5, 1).unfold(2, 5, 1).flatten(3)
-    median = windows.nanmedian(dim=3).values
-    return torch.where(torch.isfinite(median), median, log_depth)
+def _agreement_of_all(
+    frames: PosedFrames,
+    sources: Tensor,
+    log_depth: Float[Tensor, "f h w"],
+    parts: tuple[Tensor, ...],
+    settings: StereoSettings,
+) -> dict[str, Any]:
+    """`agreement` of all frames, as fields of `StereoDepth`."""
+    depth = torch.where(frames.mask, log_depth.exp(), 0.0)
+    agreed = [agreement(frames, depth, part, sources[part], tolerance=settings.tolerance) for part in parts]
+    return {
+        field.name: torch.cat([getattr(part, field.name) for part in agreed]) for field in fields(Agreement)
+    }

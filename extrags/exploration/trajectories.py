@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt32
 
 from extrags.cameras import Cameras
-from extrags.config import ExploreConfig
+from extrags.config import DEFAULT_PROFILE, PROFILES, ExploreConfig
 from extrags.errors import ShapeError
 from extrags.events import MetricRecorded, Progress, emit
 from extrags.exploration.coverage import count_pairs
@@ -273,8 +273,8 @@ def explore(
     Args:
         scene: the reconstructed scene.
         sequence: its frames; the training frames are the starts.
-        config: settings; `trajectories` is the budget. None takes the defaults.
-        freespace: where cameras may go; None carves it from the scene with default settings.
+        config: settings; `trajectories` is the budget. None takes those of the profile `balanced`.
+        freespace: where cameras may go; None carves it with the settings of that profile.
         map: like the builtin; a pool's `map` grows the branches of a wave in parallel, and what it is
             called with can be pickled. The result is the same for any number of workers.
 
@@ -286,7 +286,7 @@ def explore(
 
     Source: [ExtraGS, section "Virtual Exploration View Sampling"], see docs/references.md.
     """
-    config = ExploreConfig() if config is None else config
+    config = PROFILES[DEFAULT_PROFILE].explore if config is None else config
     cameras = sequence.training_cameras
     if freespace is None:
         freespace = carve(scene, fuse_surface(scene, cameras), cameras)

@@ -118,55 +118,10 @@ def _write_obj(colored: ColoredMesh, path: Path) -> tuple[Path, ...]:
 
 
 def _glb(colored: ColoredMesh, metric: bool) -> bytes:
-    mesh = colored.mesh
-    attributes: dict[str, np.ndarray]
-    if colored.uv is None:
-        indices = mesh.triangles.reshape(-1)
-        attributes = {
-            "POSITION": mesh.vertices,
-            "COLOR_0": _linear(colored.colors),
-            "_INVENTED": colored.invented,
-        }
-    else:
-        # A vertex has one place in the texture in each of its triangles, so every corner is a vertex.
-        corners = mesh.triangles.reshape(-1)
-        indices = np.arange(len(corners))
-        flipped = colored.uv.reshape(-1, 2) * [1, -1] + [0, 1]
-        attributes = {
-            "POSITION": mesh.vertices[corners],
-            "TEXCOORD_0": flipped,
-            "_INVENTED": colored.invented[corners],
-        }
-    chunks: list[bytes] = []
-    views: list[dict[str, Any]] = []
-    accessors: list[dict[str, Any]] = []
-
-    def view(content: bytes, target: int | None = None) -> int:
-        start = sum(len(chunk) for chunk in chunks)
-        chunks.append(content + b"\0" * (-len(content) % 4))
-        views.append(
-            {"buffer": 0, "byteOffset": start, "byteLength": len(content)}
-            | ({} if target is None else {"target": target})
-        )
-        return len(views) - 1
-
-    def accessor(values: np.ndarray, kind: int, target: int) -> int:
-        values = np.ascontiguousarray(values, dtype="<f4" if kind == _FLOAT else "<u4")
-        shape = "SCALAR" if values.ndim == 1 else f"VEC{values.shape[1]}"
-        accessors.append(
-            {
-                "bufferView": view(values.tobytes(), target),
-                "componentType": kind,
-                "count": len(values),
-                "type": shape,
-                "min": np.atleast_1d(values.min(axis=0)).tolist(),
-                "max": np.atleast_1d(values.max(axis=0)).tolist(),
-            }
-        )
-        return len(accessors) - 1
-
-    placed = {name: accessor(values, _FLOAT, _ARRAY) for name, values in attributes.items()}
-    primitive = {"attributes": placed, "indices": accessor(indices, _UINT, _ELEMENTS), "material": 0}
+    indices, attributes = _corners(colored)
+    buffer = _Buffer()
+    placed = {name: buffer.accessor(values, _FLOAT, _ARRAY) for name, values in attributes.items()}
+    corners = buffer.accessor(indices, _UINT, _ELEMENTS)
     surface: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
     # Unlit: the light is in the colours already.
     material = {
@@ -180,26 +135,79 @@ def _glb(colored: ColoredMesh, metric: bool) -> bytes:
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, "name": "surface"} | ({"scale": [_METRES] * 3} if metric else {})],
-        "meshes": [{"primitives": [primitive]}],
+        "meshes": [{"primitives": [{"attributes": placed, "indices": corners, "material": 0}]}],
         "materials": [material],
-        "accessors": accessors,
+        "accessors": buffer.accessors,
     }
     if colored.texture is not None:
-        picture = view(_png(colored.texture))
+        picture = buffer.view(_png(colored.texture))
         surface["baseColorTexture"] = {"index": 0}
         content |= {
             "images": [{"bufferView": picture, "mimeType": "image/png"}],
             "samplers": [{"magFilter": 9729, "minFilter": 9729, "wrapS": 33071, "wrapT": 33071}],
             "textures": [{"source": 0, "sampler": 0}],
         }
-    content["bufferViews"] = views
-    body = b"".join(chunks)
-    content["buffers"] = [{"byteLength": len(body)}]
-    text = json.dumps(content, separators=(",", ":")).encode()
+    content["bufferViews"] = buffer.views
+    content["buffers"] = [{"byteLength": len(buffer.content)}]
+    return _container(json.dumps(content, separators=(",", ":")).encode(), buffer.content)
+
+
+def _corners(colored: ColoredMesh) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Vertices of the triangles' corners, and the attributes of vertices by their names in glTF."""
+    mesh = colored.mesh
+    corners = mesh.triangles.reshape(-1)
+    if colored.uv is None:
+        return corners, {
+            "POSITION": mesh.vertices,
+            "COLOR_0": _linear(colored.colors),
+            "_INVENTED": colored.invented,
+        }
+    # A vertex has one place in the texture in each of its triangles, so every corner is a vertex.
+    return np.arange(len(corners)), {
+        "POSITION": mesh.vertices[corners],
+        "TEXCOORD_0": colored.uv.reshape(-1, 2) * [1, -1] + [0, 1],
+        "_INVENTED": colored.invented[corners],
+    }
+
+
+class _Buffer:
+    """The binary part of a GLB file, and how its JSON describes it."""
+
+    def __init__(self) -> None:
+        self.content = bytearray()
+        self.views: list[dict[str, Any]] = []
+        self.accessors: list[dict[str, Any]] = []
+
+    def view(self, content: bytes, target: int | None = None) -> int:
+        """Append bytes; returns the number of the view."""
+        self.views.append(
+            {"buffer": 0, "byteOffset": len(self.content), "byteLength": len(content)}
+            | ({} if target is None else {"target": target})
+        )
+        self.content += content + b"\0" * (-len(content) % 4)
+        return len(self.views) - 1
+
+    def accessor(self, values: np.ndarray, kind: int, target: int) -> int:
+        """Append an array of scalars or vectors; returns the number of the accessor."""
+        values = np.ascontiguousarray(values, dtype="<f4" if kind == _FLOAT else "<u4")
+        self.accessors.append(
+            {
+                "bufferView": self.view(values.tobytes(), target),
+                "componentType": kind,
+                "count": len(values),
+                "type": "SCALAR" if values.ndim == 1 else f"VEC{values.shape[1]}",
+                "min": np.atleast_1d(values.min(axis=0)).tolist(),
+                "max": np.atleast_1d(values.max(axis=0)).tolist(),
+            }
+        )
+        return len(self.accessors) - 1
+
+
+def _container(text: bytes, body: bytes | bytearray) -> bytes:
+    """A GLB file of its JSON and of its buffer, whose length is a multiple of four."""
     text += b" " * (-len(text) % 4)
-    length = 12 + 8 + len(text) + 8 + len(body)
     return (
-        struct.pack("<4sII", b"glTF", 2, length)
+        struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(body))
         + struct.pack("<I4s", len(text), b"JSON")
         + text
         + struct.pack("<I4s", len(body), b"BIN\0")

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from extrags.cameras import Cameras, pose_distances
-from extrags.config import FreespaceConfig
+from extrags.config import DEFAULT_PROFILE, PROFILES, FreespaceConfig
 from extrags.errors import CaptureError
 from extrags.freespace.distances import box_around, distance_to_cubes, signed_distance
 from extrags.freespace.grid import FREE, OCCUPIED, UNKNOWN, FreeSpace, rotated, to_grid
@@ -53,7 +53,7 @@ def carve(
         scene: the reconstructed scene.
         mesh: its surface.
         cameras: the training views; of more than `max_views` the most different are rendered.
-        config: settings.
+        config: settings; None takes those of the profile `balanced`.
         surface_error_mm: expected distance of each vertex from the true surface, by which clearance is
             reduced (`extrags.surface_error`); None for a surface from measured depth.
 
@@ -65,7 +65,7 @@ def carve(
 
     Source: [ExtraGS, section "Scene Initialization and Feasible Region Estimation"], see docs/references.md.
     """
-    config = FreespaceConfig() if config is None else config
+    config = PROFILES[DEFAULT_PROFILE].freespace if config is None else config
     if not len(cameras):
         raise CaptureError("no views to carve free space from")
     # Transmittance at points comes from the native kernels, and the grid is on the processor.

@@ -18,7 +18,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from extrags.config import EvaluateConfig, LpipsNet
+from extrags.config import DEFAULT_PROFILE, PROFILES, EvaluateConfig, LpipsNet
 from extrags.errors import ShapeError, WeightsError
 from extrags.metrics.lpips_networks import LAYERS
 from extrags.metrics.lpips_weights import find_weights, read_weights
@@ -283,12 +283,13 @@ def available_lpips(config: EvaluateConfig | None = None) -> dict[LpipsNet, Lpip
     """LPIPS with each backbone that the settings ask for.
 
     Args:
-        config: the backbones, and optionally where their weights are; None takes the defaults.
+        config: the backbones, and optionally where their weights are; None takes those of the profile
+            `balanced`.
 
     Raises:
         WeightsError: when the settings name weights that cannot be used.
     """
-    config = EvaluateConfig() if config is None else config
+    config = PROFILES[DEFAULT_PROFILE].evaluate if config is None else config
     found: dict[LpipsNet, Lpips | str] = {}
     for net in config.lpips_nets:
         try:

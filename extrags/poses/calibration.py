@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from extrags.cameras import field_mask
-from extrags.config import IngestConfig
+from extrags.config import DEFAULT_PROFILE, PROFILES, IngestConfig
 from extrags.errors import ConfigError, ShapeError, SourceError
 from extrags.frame_stacks import stacked
 from extrags.lens import (
@@ -174,7 +174,8 @@ def with_calibration(
     Args:
         sequence: frames as the lens made them; their pixels need not be square.
         calibration: of all of them.
-        ingest: settings of reading, of which those of distorted sources count; None takes the defaults.
+        ingest: settings of reading, of which those of distorted sources count; None takes those of the
+            profile `balanced`.
 
     Returns:
         A copy with `intrinsics` set to `estimated`; the same sequence where nothing was determined.
@@ -183,7 +184,7 @@ def with_calibration(
         ShapeError: when the frames, with square pixels, have another size than the lens.
         ConfigError: from `check_lens_use`.
     """
-    ingest = IngestConfig() if ingest is None else ingest
+    ingest = PROFILES[DEFAULT_PROFILE].ingest if ingest is None else ingest
     lens, given = calibration.lens, sequence
     sequence = sequence.with_square_pixels()
     if (lens.width, lens.height) != (sequence.width, sequence.height):
@@ -278,7 +279,7 @@ def _resampled(sequence: EndoscopicSequence, plan: Undistortion) -> EndoscopicSe
     return replace(
         sequence,
         K=np.tile(plan.K, (len(sequence), 1, 1)),
-        rgb=through(plan.colour, sequence.rgb),
+        rgb=through(plan.color, sequence.rgb),
         mask=through(plan.mask, sequence.mask),
         depth_mm=through(plan.depth, sequence.depth_mm),
         withheld_depth_mm=through(plan.depth, sequence.withheld_depth_mm),

@@ -82,11 +82,11 @@ def depth_view(sequence: EndoscopicSequence, frame: int, max_width: int) -> Dept
         return None
     spread = np.unique(np.linspace(0, len(usable) - 1, min(SAMPLES, len(usable))).round().astype(np.int64))
     blocks = sequence.rgb[frame][: height * step, : width * step]
-    colour = blocks.reshape(height, step, width, step, 3).mean(axis=(1, 3))
+    color = blocks.reshape(height, step, width, step, 3).mean(axis=(1, 3))
     told = sequence.supervised_mask(frame) & ~saturated_mask(sequence.rgb[frame])
     # A block with one bad pixel is bad: highlights move with the scope.
     told = told[: height * step, : width * step].reshape(height, step, width, step).all(axis=(1, 3))
-    texture, textured = _textures(colour, told)
+    texture, textured = _textures(color, told)
     return DepthView(
         K, points, normals, valid, texture, textured, usable[spread], float(np.median(depth[valid]))
     )
@@ -114,9 +114,9 @@ def _normals(points: np.ndarray, depth: np.ndarray, valid: np.ndarray) -> np.nda
 
 
 def _textures(
-    colour: UInt8[np.ndarray, "h w 3"] | np.ndarray, told: np.ndarray
+    color: UInt8[np.ndarray, "h w 3"] | np.ndarray, told: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    channels = np.log(colour.astype(np.float64) + 4)
+    channels = np.log(color.astype(np.float64) + 4)
     luminance = channels.mean(-1)
     redness = channels[..., 0] - channels[..., 1]
     weight = told.astype(np.float64)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from extrags.cameras import as_rotation
-from extrags.config import IngestConfig, PosesConfig
+from extrags.config import DEFAULT_PROFILE, PROFILES, IngestConfig, PosesConfig
 from extrags.errors import CaptureError, ConfigError, ShapeError
 from extrags.frame_stacks import frames_of, stacked
 from extrags.poses.attempts import attempted, enough_registered
@@ -24,10 +24,10 @@ from extrags.poses.registration_report import (
     frames_without_pose,
 )
 from extrags.poses.rgbd import align_by_depth
-from extrags.poses.scale import DENSE_SHARE, depth_scale, typical_depth
+from extrags.poses.scale import typical_depth
+from extrags.poses.unit import unit_of_map
 from extrags.scarce_depth import without_scarce_depth
 from extrags.sequence import EndoscopicSequence, ScaleSource, Split
-from extrags.sparse_depth import MIN_POINTS_PER_VIEW, interpolated_depth, pixel_lattice
 from extrags.threads import one_torch_thread
 
 __all__ = ["MIN_TRAINING_FRAMES", "PoseEstimate", "estimate_poses", "with_estimated_poses"]
@@ -145,7 +145,7 @@ def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig | None = No
 
     Args:
         sequence: frames with intrinsics; poses it may have are not looked at.
-        config: settings; None takes the defaults.
+        config: settings; None takes those of the profile `balanced`.
 
     Returns:
         Poses of the frames that registered; the others are named in the log and in the report.
@@ -158,50 +158,20 @@ def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig | None = No
 
     Source: Schönberger and Frahm: Structure-from-Motion Revisited, CVPR 2016.
     """
-    config = PosesConfig() if config is None else config
+    config = PROFILES[DEFAULT_PROFILE].poses if config is None else config
     # COLMAP and the alignment are told of pinholes; poses are those of the frames.
     native, sequence = sequence.lens is not None, sequence.as_pinhole()
     if not sequence.training_depth_known:
         # Held-out frames may have depth for the evaluation alone.
         sequence = replace(sequence, depth_mm=None)
-    if (
-        sequence.scale_source == "setting"
-        and sequence.depth_mm is None
-        and config.working_distance_mm is None
-    ):
-        raise ConfigError(
-            f"{sequence.name}: ingest.scale_mm_per_unit is the unit of the source's poses, and "
-            "poses.replace_given estimates others, whose unit it says nothing of; leave it out, or give "
-            "poses.working_distance_mm instead"
-        )
-    if len(sequence.train) < MIN_TRAINING_FRAMES:
-        raise CaptureError(
-            f"{sequence.name}: poses need at least {MIN_TRAINING_FRAMES} training frames, "
-            f"found {len(sequence.train)} beside {len(sequence.test)} that are held out "
-            "(ingest.holdout_every); give more frames"
-        )
+    _check_possible(sequence, config)
     if config.fallback == "rgbd":
         return _by_depth(sequence, config, None)
-    unknown_lens = _estimates_lens(sequence, config, native=native)
-    # The lenses that are tried have one focal length.
-    square = sequence.with_square_pixels() if unknown_lens else sequence
-    seen = square.at_most_width(config.max_width)
-    job = _job(seen, config, unknown_lens=unknown_lens)
-    no_depth = sequence.depth_mm is None or config.fallback == "never"
-    attempt = attempted(seen, job, config, _run, retry_too_few=no_depth)
-    result, registered, report = attempt.result, attempt.registered, attempt.report
-    # Told in the pixels of the frames.
-    report["mean_reprojection_px"] *= square.width / seen.width
-    calibration = None
-    if "calibration" in report:
-        calibration = LensCalibration.from_json(report["calibration"]).scaled(square.width, square.height)
-        report["calibration"] = calibration.to_json()
-        told = _LOG.info if calibration.determined else _LOG.warning
-        told("%s: %s", sequence.name, calibration.summary)
-    if enough_registered(report, config):
-        _warn_of_missing(sequence, report)
-        found = _from_colmap(seen, result, registered, report, config)
-        return replace(found, calibration=calibration)
+    found, report = _by_colmap(
+        sequence, config, unknown_lens=_estimates_lens(sequence, config, native=native)
+    )
+    if found is not None:
+        return found
     if config.fallback == "never":
         instead = "Alignment by colour and depth is switched off (poses.fallback)."
     elif sequence.depth_mm is None:
@@ -219,6 +189,49 @@ def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig | None = No
             sequence.name, report, config.min_registered_share, width=sequence.width, instead=instead
         )
     )
+
+
+def _check_possible(sequence: EndoscopicSequence, config: PosesConfig) -> None:
+    """Refuse a unit of poses that are not estimated, and too few frames."""
+    of_given_poses = sequence.scale_source == "setting"
+    if of_given_poses and sequence.depth_mm is None and config.working_distance_mm is None:
+        raise ConfigError(
+            f"{sequence.name}: ingest.scale_mm_per_unit is the unit of the source's poses, and "
+            "poses.replace_given estimates others, whose unit it says nothing of; leave it out, or give "
+            "poses.working_distance_mm instead"
+        )
+    if len(sequence.train) < MIN_TRAINING_FRAMES:
+        raise CaptureError(
+            f"{sequence.name}: poses need at least {MIN_TRAINING_FRAMES} training frames, "
+            f"found {len(sequence.train)} beside {len(sequence.test)} that are held out "
+            "(ingest.holdout_every); give more frames"
+        )
+
+
+def _by_colmap(
+    sequence: EndoscopicSequence, config: PosesConfig, *, unknown_lens: bool
+) -> tuple[PoseEstimate | None, dict[str, Any]]:
+    """By COLMAP; None where too few training frames registered, and the report in either case."""
+    # The lenses that are tried have one focal length.
+    square = sequence.with_square_pixels() if unknown_lens else sequence
+    seen = square.at_most_width(config.max_width)
+    job = _job(seen, config, unknown_lens=unknown_lens)
+    no_depth = sequence.depth_mm is None or config.fallback == "never"
+    attempt = attempted(seen, job, config, _run, retry_too_few=no_depth)
+    report = attempt.report
+    # Told in the pixels of the frames.
+    report["mean_reprojection_px"] *= square.width / seen.width
+    calibration = None
+    if "calibration" in report:
+        calibration = LensCalibration.from_json(report["calibration"]).scaled(square.width, square.height)
+        report["calibration"] = calibration.to_json()
+        told = _LOG.info if calibration.determined else _LOG.warning
+        told("%s: %s", sequence.name, calibration.summary)
+    if not enough_registered(report, config):
+        return None, report
+    _warn_of_missing(sequence, report)
+    found = _from_colmap(seen, attempt.result, attempt.registered, report, config)
+    return replace(found, calibration=calibration), report
 
 
 def _job(sequence: EndoscopicSequence, config: PosesConfig, *, unknown_lens: bool = False) -> PoseJob:
@@ -258,42 +271,13 @@ def _from_colmap(
     config: PosesConfig,
 ) -> PoseEstimate:
     poses, points = _cleaned(result.world_from_camera, registered), result.points
-    mm_per_unit: float | None = None
-    scale_source: ScaleSource = "source"
-    seen = (result.observed_frame, result.observed_point, result.observed_px)
-    scale = truth = None
-    depth_factor: float | None = 1.0
-    if sequence.depth_mm is not None:
-        # In the unit of the source, which may be any.
-        scale = depth_scale(poses, points, *seen, sequence.depth_mm, sequence.mask)
-        depth_factor = None if scale is None else 1.0
-    elif sequence.true_depth_mm is not None and config.working_distance_mm is None:
-        truth = depth_scale(poses, points, *seen, sequence.true_depth_mm, sequence.mask)
-    if scale is not None and sequence.metric:
-        mm_per_unit, scale_source = scale.mm_per_unit, "depth"
-        report["scale"] = asdict(scale)
-    elif config.working_distance_mm is not None:
-        typical = None
-        if scale is not None and sequence.depth_mm is not None:
-            mapped = sequence.train[registered[sequence.train]]
-            typical = typical_depth(sequence.depth_mm, sequence.mask, mapped, least_share=DENSE_SHARE)
-        if scale is not None and typical is not None:
-            depth_factor = config.working_distance_mm / typical
-            mm_per_unit = scale.mm_per_unit * depth_factor
-        else:
-            mm_per_unit = _told_scale(sequence, poses, result, config.working_distance_mm)
-            if scale is not None:
-                depth_factor = mm_per_unit / scale.mm_per_unit
-        scale_source = "working_distance"
-        report["scale"] = {"mm_per_unit": mm_per_unit, "working_distance_mm": config.working_distance_mm}
-    length = mm_per_unit
-    if length is None and scale is not None:
-        # Of no known unit, but of one with the depth.
-        length = scale.mm_per_unit
-    if length is not None:
-        poses[:, :3, 3] *= length
-        points = points * length
-    if depth_factor is None:
+    unit = unit_of_map(sequence, poses, registered, result, config)
+    if unit.length is not None:
+        poses[:, :3, 3] *= unit.length
+        points = points * unit.length
+    if unit.report is not None:
+        report["scale"] = unit.report
+    if unit.depth_factor is None:
         _LOG.warning(
             "%s: too little of the depth lies where the poses have points: its unit is not that of the "
             "poses, and it is left out",
@@ -306,31 +290,12 @@ def _from_colmap(
         points=points.astype(np.float32),
         points_rgb=result.points_rgb,
         mean_reprojection_px=float(report["mean_reprojection_px"]),
-        metric=mm_per_unit is not None,
+        metric=unit.metric,
         report=report,
-        scale_source=scale_source,
-        truth_per_unit=None if truth is None else truth.mm_per_unit,
-        depth_factor=depth_factor,
+        scale_source=unit.scale_source,
+        truth_per_unit=unit.truth_per_unit,
+        depth_factor=unit.depth_factor,
     )
-
-
-def _told_scale(
-    sequence: EndoscopicSequence, poses: np.ndarray, result: PoseJobResult, working_distance_mm: float
-) -> float:
-    """Millimetres per unit, so that surface is so far from the training frames, in the median over pixels.
-
-    Over pixels and not over points: points lie where features are, in a tube mostly far away. Depth is
-    interpolated between the points that each frame observes.
-    """
-    pose = poses[result.observed_frame]
-    z = np.einsum("oi,oi->o", pose[:, :3, 2], result.points[result.observed_point] - pose[:, :3, 3])
-    found = []
-    for frame in np.unique(result.observed_frame):
-        rows = (result.observed_frame == frame) & (z > 0)
-        if rows.sum() >= MIN_POINTS_PER_VIEW:
-            lattice = pixel_lattice(sequence.mask[frame])
-            found.append(interpolated_depth(result.observed_px[rows], z[rows], lattice))
-    return working_distance_mm / float(np.median(np.concatenate(found) if found else z[z > 0]))
 
 
 def _by_depth(
@@ -405,8 +370,8 @@ def with_estimated_poses(
     Args:
         sequence: what poses were estimated of.
         estimate: of its frames.
-        ingest: settings of reading, which say what becomes of frames of a distorted lens; None takes the
-            defaults.
+        ingest: settings of reading, which say what becomes of frames of a distorted lens; None takes
+            those of the profile `balanced`.
 
     Raises:
         ShapeError: when the estimate is of another sequence.

@@ -126,8 +126,8 @@ class _Alignment:
         poses = np.full((len(self.sequence), 4, 4), np.nan)
         for frame, posed in self.placed.items():
             poses[frame] = posed.world_from_camera
-        points, colours = self._surface()
-        return RgbdAlignment(poses, points, colours, self._account(residual))
+        points, colors = self._surface()
+        return RgbdAlignment(poses, points, colors, self._account(residual))
 
     def _build_model(self, frames: list[int]) -> None:
         """Place training frames, beginning with the first; where most cannot be joined to it, with another.
@@ -291,19 +291,19 @@ class _Alignment:
     def _surface(self) -> tuple[np.ndarray, np.ndarray]:
         """A thin cloud of what the model frames show."""
         each = max(1, POINTS // len(self.model))
-        points, colours = [], []
+        points, colors = [], []
         for frame in self.model:
             view, pose = self.placed[frame].view, self.placed[frame].world_from_camera
             chosen = spread_evenly(view.samples, each)
             local = view.points.reshape(-1, 3)[chosen]
             points.append(local @ pose[:3, :3].T + pose[:3, 3])
             column, row = np.floor(project_points(local, self.sequence.K[frame])).astype(np.int64).T
-            colours.append(
+            colors.append(
                 self.sequence.rgb[frame][
                     np.clip(row, 0, self.sequence.height - 1), np.clip(column, 0, self.sequence.width - 1)
                 ]
             )
-        return np.concatenate(points), np.concatenate(colours)
+        return np.concatenate(points), np.concatenate(colors)
 
     def _account(self, residual: float) -> dict[str, Any]:
         frames = {}

@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from extrags.frame_quantiles import median_of_frames
+from extrags.sparse_depth import MIN_POINTS_PER_VIEW, interpolated_depth, pixel_lattice
 
-__all__ = ["DENSE_SHARE", "DepthScale", "depth_scale", "typical_depth"]
+__all__ = ["DENSE_SHARE", "DepthScale", "depth_scale", "typical_depth", "working_distance_scale"]
 
 MIN_OBSERVATIONS = 20
 """A median over fewer is no measurement of scale."""
@@ -102,3 +103,36 @@ def typical_depth(
     if known == 0 or known < least_share * valid:
         return None
     return median_of_frames(lambda: (depth[k][mask[k] & (depth[k] > 0)] for k in frames))
+
+
+def working_distance_scale(
+    world_from_camera: Float[np.ndarray, "f 4 4"],
+    points: Float[np.ndarray, "p 3"],
+    observed_frame: Int[np.ndarray, "o"],
+    observed_point: Int[np.ndarray, "o"],
+    observed_px: Float[np.ndarray, "o 2"],
+    mask: Bool[np.ndarray, "f h w"],
+    working_distance_mm: float,
+) -> float:
+    """Millimetres per unit, so that surface is so far from the frames, in the median over pixels.
+
+    Over pixels and not over points: points lie where features are, in a tube mostly far away. Depth is
+    interpolated between the points that each frame observes.
+
+    Args:
+        world_from_camera: poses in the reconstruction's unit.
+        points: triangulated points in the same unit.
+        observed_frame: frame of each observation.
+        observed_point: index of the point it observes.
+        observed_px: where in the image, in pixels, centres at +0.5.
+        mask: pixels that count.
+        working_distance_mm: the distance that the median becomes.
+    """
+    pose = world_from_camera[observed_frame]
+    z = np.einsum("oi,oi->o", pose[:, :3, 2], points[observed_point] - pose[:, :3, 3])
+    found = []
+    for frame in np.unique(observed_frame):
+        rows = (observed_frame == frame) & (z > 0)
+        if rows.sum() >= MIN_POINTS_PER_VIEW:
+            found.append(interpolated_depth(observed_px[rows], z[rows], pixel_lattice(mask[frame])))
+    return working_distance_mm / float(np.median(np.concatenate(found) if found else z[z > 0]))

@@ -324,7 +324,7 @@ def _lenses() -> Iterator[_Case]:
     yield _Case("lens", "beside and behind", _with(base, means=means), compared=False, lens=barrel)
 
 
-def _colours() -> Iterator[_Case]:
+def _colors() -> Iterator[_Case]:
     base = _base()
     for factor in (0.0, 1e4):
         yield _Case("harmonics", f"times {factor:g}", _with(base, sh=base["sh"] * factor))
@@ -351,7 +351,7 @@ AXES: dict[str, Callable[[], Iterator[_Case]]] = {
     "duplicate depths": _depths,
     "focal length": _focal_lengths,
     "lens": _lenses,
-    "harmonics": _colours,
+    "harmonics": _colors,
     "number of Gaussians": _counts,
 }
 """Cases by the quantity that takes extreme values."""

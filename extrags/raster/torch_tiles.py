@@ -261,7 +261,7 @@ def _blended(
             _composite(part.reshape(*rows.shape, RECORD_SIZE), tiles[chosen], passed[chosen], width)
             for part, rows, (chosen, _) in zip(parts, entries, batches, strict=True)
         ]
-        result = result.index_add(0, active, torch.cat([colours for colours, _ in found]))
+        result = result.index_add(0, active, torch.cat([colors for colors, _ in found]))
         passed = passed.index_copy(0, active, torch.cat([behind for _, behind in found]))
     return result
 

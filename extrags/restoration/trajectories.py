@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from extrags.cameras import Cameras
 from extrags.confidence import PerceptualDifference
-from extrags.config import CoarseConfig, EnhanceConfig
+from extrags.config import DEFAULT_PROFILE, PROFILES, CoarseConfig, EnhanceConfig
 from extrags.errors import ShapeError
 from extrags.pseudo_views import PseudoViews
 from extrags.restoration.backends import train_enhancer
@@ -41,8 +41,8 @@ def restore(
         sequence: its frames; only training frames are used.
         trajectories: virtual views of each trajectory, its real start first (`Exploration.trajectories`);
             those without another are left out.
-        config: backend and budgets; None takes the defaults.
-        coarse: settings the scene was reconstructed with; None takes the defaults.
+        config: backend and budgets; None takes those of the profile `balanced`.
+        coarse: settings the scene was reconstructed with; None takes those of the profile `balanced`.
         measure: behind the pixel-level confidence; None takes LPIPS where its weights can be found.
         enhancer: the scene's restorer (`train_enhancer`); None prepares it.
 
@@ -50,12 +50,13 @@ def restore(
         ShapeError: when there is no view at all.
         ExtragsError: as `extrags.restoration.backends.train_enhancer`.
     """
-    config = EnhanceConfig() if config is None else config
+    config = PROFILES[DEFAULT_PROFILE].enhance if config is None else config
     trajectories = [cameras for cameras in trajectories if len(cameras) > 1]
     if not trajectories:
         raise ShapeError(f"{sequence.name}: no trajectory has a view beyond its start; nothing to restore")
     if enhancer is None:
-        enhancer = train_enhancer(scene, sequence, config, CoarseConfig() if coarse is None else coarse)
+        coarse = PROFILES[DEFAULT_PROFILE].coarse if coarse is None else coarse
+        enhancer = train_enhancer(scene, sequence, config, coarse)
     measure = PerceptualDifference.available() if measure is None else measure
     parts = list(restored_batches(scene, sequence, trajectories, enhancer, config, measure))
     return PseudoViews.concatenated(parts).quantised()

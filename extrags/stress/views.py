@@ -54,8 +54,8 @@ def _references(
     """Exact views of a plane, as references of themselves."""
     cameras, depth, _, _ = plane_views(frames, 32, 24, unit=unit, offset_mm=offset_mm)
     known = torch.from_numpy(depth)[:, None]
-    colour = image("noise", frames, 3, 24, 32) * 0.5 + 0.2 if rgb is None else rgb
-    packed = torch.cat([colour, torch.ones_like(known), 1 / known, torch.ones_like(known)], dim=1)
+    color = image("noise", frames, 3, 24, 32) * 0.5 + 0.2 if rgb is None else rgb
+    packed = torch.cat([color, torch.ones_like(known), 1 / known, torch.ones_like(known)], dim=1)
     light = NearFieldLight.initial(frames, 2 * unit)
     references = ReferenceViews(
         np.arange(frames),
@@ -170,25 +170,25 @@ def _filled_depth(effort: Effort) -> Iterator[Trial]:
 
 
 def _layers(kind: str, height: int, width: int, *, unit: float = 1.0, hole: bool = True) -> Layers:
-    colour = image(kind, 1, 3, height, width)
+    color = image(kind, 1, 3, height, width)
     one = torch.ones(1, 1, height, width)
     alpha = one.clone()
     if hole:
         alpha[..., : (width + 1) // 2] = 0
     zero = torch.zeros_like(one)
     return Layers.of(
-        rendered=colour * alpha,
+        rendered=color * alpha,
         alpha=alpha,
         depth_mm=3.0 * unit * alpha,
         spread=zero,
         uncertainty=1 - alpha,
-        nearest=colour,
+        nearest=color,
         nearest_weight=0.5 * one,
-        blend=colour,
+        blend=color,
         blend_weight=0.5 * one,
         log_ratio=zero,
         ray_length=1.1 * one,
-        invented=torch.zeros_like(colour),
+        invented=torch.zeros_like(color),
         invented_weight=zero,
     )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
 from extrags.cameras import rays_of_pixels
-from extrags.config import CoarseConfig, FinetuneConfig
+from extrags.config import DEFAULT_PROFILE, PROFILES, CoarseConfig, FinetuneConfig
 from extrags.frame_quantiles import quantile_of_frames
 from extrags.frame_stacks import stacked
 from extrags.gaussians import Gaussians
@@ -105,8 +106,9 @@ def finetune(
         scene: the coarse scene; the optimisation runs where it is, and so does the result.
         sequence: posed frames; only training frames are used.
         pseudo_views: restored virtual views with confidences, or None.
-        config: budgets and shares; None takes the defaults.
-        coarse: rates and weights, those the coarse scene was made with; None takes the defaults.
+        config: budgets and shares; None takes those of the profile `balanced`.
+        coarse: rates and weights, those the coarse scene was made with; None takes those of the profile
+            `balanced`.
         stage: named in progress events.
         frame_weights: of the training frames, where they are known from the reconstruction; None looks for
             blurred frames where `coarse.inconsistent_frames` is `weight`.
@@ -120,42 +122,20 @@ def finetune(
     """
     # Not as a decorator, which would hold the virtual views for its caller.
     with one_torch_thread():
-        config = FinetuneConfig() if config is None else config
-        coarse = CoarseConfig() if coarse is None else coarse
+        config = PROFILES[DEFAULT_PROFILE].finetune if config is None else config
+        coarse = PROFILES[DEFAULT_PROFILE].coarse if coarse is None else coarse
         frames = sequence.train
         depth = median_depth(sequence, frames)
-        start = scene
         max_gaussians = round(config.growth * coarse.densify.max_gaussians)
+        start = scene
         if pseudo_views is not None and config.seed_holes:
             room = max_gaussians - len(scene.gaussians)
-            new_gaussians = hole_gaussians(
-                scene.to("cpu"),
-                sequence,
-                pseudo_views,
-                room,
-                thickness=coarse.thickness,
-                max_distance=MAX_GUESS_DISTANCE * depth,
-            )
-            if new_gaussians is not None:
-                filled = Gaussians.concatenated(scene.gaussians, new_gaussians.to(scene.device))
-                start = Scene(filled, scene.light)
-        if config.keep_scene and len(start.gaussians) == len(scene.gaussians):
+            start = _with_filled_holes(scene, sequence, pseudo_views, room, coarse.thickness, depth)
+        if config.keep_scene and start is scene:
             return TrainingResult(scene.detached(), [])
-        if coarse.inconsistent_frames == "weight":
-            real, _ = weighted_views(sequence, frames, coarse, frame_weights)
-        else:
-            real = real_views(sequence, frames)
-        virtual = [] if pseudo_views is None else virtual_views(pseudo_views, config)
+        draw = _draws(sequence, pseudo_views, config, coarse, frame_weights, scene.device)
         # A caller that keeps none either has their floats out of memory while the scene is optimised.
         del pseudo_views
-        real, virtual = ([view.to(scene.device) for view in views] for views in (real, virtual))
-        generator = np.random.default_rng(config.seed)
-        next_real, next_virtual = epochs(len(real), generator), epochs(max(1, len(virtual)), generator)
-        pattern = virtual_steps(config, any_virtual=bool(virtual))
-
-        def draw(iteration: int) -> View:
-            return virtual[next(next_virtual)] if pattern[iteration] else real[next(next_real)]
-
         densify = {"start_share": 0.0, "stop_share": config.densify_share, "max_gaussians": max_gaussians}
         schedule = coarse_schedule(
             _with_loss_weights(coarse, config),
@@ -165,18 +145,65 @@ def finetune(
             iterations=config.iterations,
             densify=coarse.densify.model_copy(update=densify),
         )
-        schedule = replace(schedule, photometric_weight=config.photometric_weight)
+        # All harmonics are active from the first step: the scene is optimised already.
+        schedule = replace(schedule, photometric_weight=config.photometric_weight).resumed(seed=config.seed)
         if config.keep_scene:
             fixed = len(scene.gaussians)
             return optimise(
                 start,
                 draw,
-                filling_schedule(schedule.resumed(seed=config.seed)),
+                filling_schedule(schedule),
                 make_step=lambda scene, schedule: FillingStep(scene, schedule, fixed),
             )
-        # All harmonics are active from the first step: the scene is optimised already.
         footprint = smallest_footprint(coarse, sequence.cameras[frames])
-        return optimise(start, draw, schedule.resumed(seed=config.seed), footprint=footprint)
+        return optimise(start, draw, schedule, footprint=footprint)
+
+
+def _with_filled_holes(
+    scene: Scene,
+    sequence: EndoscopicSequence,
+    pseudo_views: PseudoViews,
+    room: int,
+    thickness: float,
+    depth: float,
+) -> Scene:
+    """The scene with `hole_gaussians`, or itself where there are none; `depth` is its length scale."""
+    new_gaussians = hole_gaussians(
+        scene.to("cpu"),
+        sequence,
+        pseudo_views,
+        room,
+        thickness=thickness,
+        max_distance=MAX_GUESS_DISTANCE * depth,
+    )
+    if new_gaussians is None:
+        return scene
+    return Scene(Gaussians.concatenated(scene.gaussians, new_gaussians.to(scene.device)), scene.light)
+
+
+def _draws(
+    sequence: EndoscopicSequence,
+    pseudo_views: PseudoViews | None,
+    config: FinetuneConfig,
+    coarse: CoarseConfig,
+    frame_weights: FrameWeights | None,
+    device: torch.device,
+) -> Callable[[int], View]:
+    """What each iteration draws: a real or a virtual view, by the pattern of `virtual_steps`."""
+    if coarse.inconsistent_frames == "weight":
+        real, _ = weighted_views(sequence, sequence.train, coarse, frame_weights)
+    else:
+        real = real_views(sequence, sequence.train)
+    virtual = [] if pseudo_views is None else virtual_views(pseudo_views, config)
+    real, virtual = ([view.to(device) for view in views] for views in (real, virtual))
+    generator = np.random.default_rng(config.seed)
+    next_real, next_virtual = epochs(len(real), generator), epochs(max(1, len(virtual)), generator)
+    pattern = virtual_steps(config, any_virtual=bool(virtual))
+
+    def draw(iteration: int) -> View:
+        return virtual[next(next_virtual)] if pattern[iteration] else real[next(next_real)]
+
+    return draw
 
 
 def _with_loss_weights(coarse: CoarseConfig, config: FinetuneConfig) -> CoarseConfig:

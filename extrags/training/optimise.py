@@ -129,7 +129,7 @@ def optimise(
 def _psnr(observation: Observation, view: View) -> float:
     """Of the view just drawn, inside its weights."""
     weight = (view.weights > 0).float()[..., None]
-    squares = (observation.rendering.rgb[0].detach() - view.colours).square()
+    squares = (observation.rendering.rgb[0].detach() - view.colors).square()
     error = (squares * weight).sum() / (3 * weight.sum()).clamp_min(1)
     return -10 * math.log10(max(float(error), 1e-12))
 

@@ -11,7 +11,7 @@ from jaxtyping import Int
 
 from extrags.arguments import check_sequence_argument, check_settings_argument
 from extrags.cameras import Cameras
-from extrags.config import CoarseConfig, DensifyConfig
+from extrags.config import DEFAULT_PROFILE, PROFILES, CoarseConfig, DensifyConfig
 from extrags.errors import CaptureError, ConfigError
 from extrags.illumination import NearFieldLight
 from extrags.scene import NEAR, SHALLOWEST, Scene
@@ -46,7 +46,7 @@ def reconstruct(
 
     Args:
         sequence: posed frames.
-        config: budgets, rates and weights; None takes the defaults.
+        config: budgets, rates and weights; None takes those of the profile `balanced`.
         frames: which frames to use; default: those of `config.train_on`, the split's training frames or,
             for the oracle, all.
         stage: named in progress events.
@@ -72,7 +72,7 @@ def reconstruct(
     docs/references.md.
     """
     check_sequence_argument(sequence, "reconstruct")
-    config = CoarseConfig() if config is None else config
+    config = PROFILES[DEFAULT_PROFILE].coarse if config is None else config
     check_settings_argument(config, CoarseConfig, "reconstruct", 'extrags.PROFILES["quick"].coarse')
     if not sequence.training_depth_known:
         # The oracle is given held-out frames too, whose depth is for the evaluation alone.
@@ -82,31 +82,12 @@ def reconstruct(
     if len(chosen) == 0:
         raise CaptureError(f"{sequence.name}: no training frames")
     depth = median_depth(sequence, chosen)
-    light: NearFieldLight | None = None
     if not config.light.enabled and depth < SHALLOWEST:
         raise CaptureError(
             f"{sequence.name}: the typical depth is {depth:.3g} units, too small without light, as "
             f"nothing nearer than {NEAR:g} is rendered; scale poses and depth up, or enable coarse.light"
         )
-    if earlier is None:
-        if config.light.enabled:
-            light = NearFieldLight.initial(len(chosen), depth, config.light)
-        gaussians = starting_gaussians(
-            sequence,
-            chosen,
-            config.starting_points(valid_pixels(sequence, chosen)),
-            light=light,
-            sh_degree=config.sh_degree,
-            thickness=config.thickness,
-            seed=config.seed,
-        )
-        start = Scene(gaussians, light)
-    elif refines_poses(sequence, config):
-        raise ConfigError(
-            f"{sequence.name}: poses are refined (coarse.refine_poses); the earlier scene belongs to others"
-        )
-    else:
-        start = continued_start(earlier, sequence, chosen, config)
+    start = _start(sequence, chosen, config, depth, earlier)
     views, weights = weighted_views(sequence, chosen, config)
     for statement in () if weights is None else weights.statements:
         logger.warning("%s: %s", sequence.name, statement)
@@ -119,18 +100,45 @@ def reconstruct(
     if config.normal_weight > 0:
         points = start.gaussians.means.numpy()
         schedule = replace(schedule, normals=NormalTerm.at(points, config, schedule.iterations))
-    poses = None
+    cameras, poses = sequence.cameras[chosen], None
     if refines_poses(sequence, config):
-        settings = config.pose_refinement
-        poses = PoseRefinement(sequence.cameras[chosen], settings, depth, config.iterations)
+        poses = PoseRefinement(cameras, config.pose_refinement, depth, config.iterations)
     result = optimise(
         start.to(device),
         lambda _: views[next(order)],
         schedule,
         poses=poses,
-        footprint=smallest_footprint(config, sequence.cameras[chosen]),
+        footprint=smallest_footprint(config, cameras),
     )
     return replace(result, frame_weights=weights)
+
+
+def _start(
+    sequence: EndoscopicSequence,
+    frames: Int[np.ndarray, "m"],
+    config: CoarseConfig,
+    depth: float,
+    earlier: EarlierScene | None,
+) -> Scene:
+    """What the optimisation starts from: new Gaussians and light, or an earlier scene."""
+    if earlier is not None:
+        if refines_poses(sequence, config):
+            raise ConfigError(
+                f"{sequence.name}: poses are refined (coarse.refine_poses); the earlier scene belongs to "
+                "others"
+            )
+        return continued_start(earlier, sequence, frames, config)
+    light = NearFieldLight.initial(len(frames), depth, config.light) if config.light.enabled else None
+    gaussians = starting_gaussians(
+        sequence,
+        frames,
+        config.starting_points(valid_pixels(sequence, frames)),
+        light=light,
+        sh_degree=config.sh_degree,
+        thickness=config.thickness,
+        seed=config.seed,
+    )
+    return Scene(gaussians, light)
 
 
 def smallest_footprint(config: CoarseConfig, cameras: Cameras) -> SmallestFootprint | None:

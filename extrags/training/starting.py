@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import binary_dilation
 from scipy.spatial import cKDTree
 
-from extrags.cameras import rays_of_pixels
+from extrags.cameras import Cameras, rays_of_pixels
 from extrags.errors import CaptureError
 from extrags.frame_quantiles import median_of_frames
 from extrags.frame_stacks import empty_stack, frames_of, stacked
@@ -135,19 +135,51 @@ def starting_gaussians(
     """
     cameras = sequence.cameras[frames]
     at_random = starts_at_random(sequence, frames)
-    if at_random:
-        within = depth_range(cameras, sequence.name)
-        _log.warning(
-            "%s: neither depth nor enough sparse points are known; the reconstruction starts from random "
-            "points, %.3g to %.3g units from the cameras, %s",
-            sequence.name,
-            within.near,
-            within.far,
-            "round the point they look at" if within.meeting is not None else "along their path",
-        )
-        depth = random_depth(cameras, within, seed=seed)
-    else:
-        depth = _starting_depth(sequence, frames)
+    depth = _random_depth(sequence, cameras, seed) if at_random else _starting_depth(sequence, frames)
+    chosen, z = _starting_pixels(sequence, frames, depth, where, max_points, seed)
+    rays = rays_of_pixels(cameras, chosen)
+    view = chosen // (sequence.width * sequence.height)
+    points = cameras.centers[view] + z[:, None] * rays
+    rgb = _of_frames(sequence.rgb, frames).reshape(-1, 3)[chosen].astype(np.float64) / 255
+    if light is not None:
+        local = np.einsum("nji,nj->ni", cameras.world_from_camera[view, :3, :3], z[:, None] * rays)
+        rgb = light.albedo(torch.from_numpy(rgb), torch.from_numpy(local)).detach().numpy()
+    points, rgb = thin_out(points, rgb, max_points)
+    floor = 1e-3 * float(np.median(z))
+    return Gaussians.from_points(
+        points,
+        np.clip(rgb, LEAST_COLOR, None),
+        np.maximum(_spacing(points), floor),
+        opacity=RANDOM_OPACITY if at_random else SURFACE_OPACITY,
+        sh_degree=sh_degree,
+        normals=None if at_random or thickness == 1 else surface_normals(points),
+        thickness=1.0 if at_random else thickness,
+    )
+
+
+def _random_depth(sequence: EndoscopicSequence, cameras: Cameras, seed: int) -> Float[np.ndarray, "m h w"]:
+    """Random depth where nothing tells it, with a warning."""
+    within = depth_range(cameras, sequence.name)
+    _log.warning(
+        "%s: neither depth nor enough sparse points are known; the reconstruction starts from random "
+        "points, %.3g to %.3g units from the cameras, %s",
+        sequence.name,
+        within.near,
+        within.far,
+        "round the point they look at" if within.meeting is not None else "along their path",
+    )
+    return random_depth(cameras, within, seed=seed)
+
+
+def _starting_pixels(
+    sequence: EndoscopicSequence,
+    frames: Int[np.ndarray, "m"],
+    depth: Float[np.ndarray, "m h w"],
+    where: Bool[np.ndarray, "m h w"] | None,
+    max_points: int,
+    seed: int,
+) -> tuple[Int[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+    """Flat positions of the pixels that start Gaussians, before they are thinned out, and their depth."""
 
     def startable() -> Iterator[Bool[np.ndarray, "h w"]]:
         for position, frame in enumerate(frames):
@@ -159,10 +191,9 @@ def starting_gaussians(
     if count == 0:
         raise CaptureError(f"{sequence.name}: no valid depth in any training frame")
     # A point per pixel of all frames would be millions; a tenfold surplus is enough for thinning.
-    generator = np.random.default_rng(seed)
     drawn = None
     if count > 10 * max_points:
-        drawn = np.sort(generator.choice(count, 10 * max_points, replace=False))
+        drawn = np.sort(np.random.default_rng(seed).choice(count, 10 * max_points, replace=False))
     chosen = _positions(valid, drawn)
     z = depth.reshape(-1)[chosen].astype(np.float64)
     if (background := is_background(z)).any():
@@ -174,28 +205,15 @@ def starting_gaussians(
             FARTHEST,
         )
         chosen, z = chosen[~background], z[~background]
-    rays = rays_of_pixels(cameras, chosen)
-    view = chosen // (sequence.width * sequence.height)
-    points = cameras.centers[view] + z[:, None] * rays
-    rgb = _of_frames(sequence.rgb, frames).reshape(-1, 3)[chosen].astype(np.float64) / 255
-    if light is not None:
-        local = np.einsum("nji,nj->ni", cameras.world_from_camera[view, :3, :3], z[:, None] * rays)
-        rgb = light.albedo(torch.from_numpy(rgb), torch.from_numpy(local)).detach().numpy()
-    points, rgb = thin_out(points, rgb, max_points)
+    return chosen, z
+
+
+def _spacing(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+    """Root mean square of each point's distances to its three nearest neighbours; 0 for a point alone."""
     neighbours = min(4, len(points))
     distance, _ = cKDTree(points).query(points, k=neighbours)
     distance = np.atleast_2d(distance.reshape(len(points), -1))
-    radius = np.sqrt(np.mean(distance[:, 1:] ** 2, axis=1)) if neighbours > 1 else distance[:, 0]
-    floor = 1e-3 * float(np.median(z))
-    return Gaussians.from_points(
-        points,
-        np.clip(rgb, LEAST_COLOR, None),
-        np.maximum(radius, floor),
-        opacity=RANDOM_OPACITY if at_random else SURFACE_OPACITY,
-        sh_degree=sh_degree,
-        normals=None if at_random or thickness == 1 else surface_normals(points),
-        thickness=1.0 if at_random else thickness,
-    )
+    return np.asarray(np.sqrt(np.mean(distance[:, 1:] ** 2, axis=1)) if neighbours > 1 else distance[:, 0])
 
 
 def surface_normals(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

@@ -119,7 +119,7 @@ class AutogradStep:
         like = rendering.rgb
         loss = schedule.photometric_weight * l1_ssim_loss(
             rendering.rgb[0],
-            view.colours.to(like),
+            view.colors.to(like),
             dssim_weight=schedule.dssim_weight,
             mask=view.weights.to(like),
             ssim_mask=None if view.ssim_weight is None else view.ssim_weight.to(like),
@@ -250,7 +250,7 @@ class NativeStep:
         return Target(
             camera.viewmats[0].astype(np.float32),
             camera.K[0].astype(np.float32),
-            view.colours,
+            view.colors,
             lens=camera.lens,
             weight=view.weights,
             ssim_weight=view.ssim_weight,

@@ -56,7 +56,7 @@ class View:
     weight_factor: float = 1.0
 
     @property
-    def colours(self) -> Float[Tensor, "h w 3"]:
+    def colors(self) -> Float[Tensor, "h w 3"]:
         """The target in [0, 1]; decoded anew whenever it is asked for."""
         return _from_steps(self.rgb)
 
@@ -99,7 +99,7 @@ def in_steps(values: Float[np.ndarray, "*n"]) -> UInt8[Tensor, "*n"] | Float[Ten
         values: of any shape.
 
     Returns:
-        What `View.colours` and `View.weights` decode to the same float32 values, bit by bit.
+        What `View.colors` and `View.weights` decode to the same float32 values, bit by bit.
     """
     exact = np.array(values, dtype=np.float32)
     # Not a number is no step.

@@ -12,7 +12,7 @@ from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence, saturated_mask
 from extrags.threads import one_torch_thread
 from extrags.view_synthesis.references import SEEN_WEIGHT, LightTransfer, ReferenceViews, visibility_of
-from extrags.view_synthesis.shrinkage import colour_support, shrunk_sh0
+from extrags.view_synthesis.shrinkage import color_support, shrunk_sh0
 from extrags.view_synthesis.warp import with_fitted_transfer
 
 __all__ = ["gather_references"]
@@ -105,7 +105,7 @@ def _depth_and_seen(
                 sequence.cameras[int(frame)], visibility=True, visibility_mask=mask[None]
             )
         seen.append(visibility_of(rendering)[0] > SEEN_WEIGHT)
-        support += colour_support(scene, sequence.cameras[int(frame)], rendering)
+        support += color_support(scene, sequence.cameras[int(frame)], rendering)
         rendered = torch.where(rendering.alpha[0] > SOLID_ALPHA, rendering.depth[0], torch.zeros(()))
         depth = rendered
         reliable = sequence.reliable_depth_mm(int(frame))

@@ -15,7 +15,7 @@ from extrags.errors import ShapeError
 from extrags.illumination import NearFieldLight
 from extrags.raster import Rendering
 from extrags.scene import Scene
-from extrags.view_synthesis.shrinkage import colour_support, shrunk_sh0
+from extrags.view_synthesis.shrinkage import color_support, shrunk_sh0
 
 __all__ = ["SEEN_WEIGHT", "LightTransfer", "ReferenceViews", "visibility_of"]
 
@@ -137,7 +137,7 @@ class ReferenceViews:
                     self.cameras[view], visibility=True, visibility_mask=self.valid[[view]]
                 )
             seen.append(visibility_of(rendering) > SEEN_WEIGHT)
-            support += colour_support(scene, self.cameras[view], rendering)
+            support += color_support(scene, self.cameras[view], rendering)
         return replace(self, seen=torch.cat(seen), sh0=shrunk_sh0(scene, support))
 
     def shown(self, scene: Scene) -> Scene:

@@ -29,14 +29,14 @@ from extrags.errors import ShapeError
 from extrags.raster import Rendering
 from extrags.scene import Scene
 
-__all__ = ["PRIOR_PX", "colour_support", "shrunk_sh0"]
+__all__ = ["PRIOR_PX", "color_support", "shrunk_sh0"]
 
 PRIOR_PX = 4.0
 """What the neighbours' mean is worth, in pixels of training views under a gain of one."""
 NEIGHBOURS = 16
 
 
-def colour_support(scene: Scene, camera: Cameras, rendering: Rendering) -> Float[Tensor, "n"]:
+def color_support(scene: Scene, camera: Cameras, rendering: Rendering) -> Float[Tensor, "n"]:
     """Pixels of a view that determine the colour of each Gaussian, weighted by the light that falls there.
 
     Args:
@@ -63,7 +63,7 @@ def shrunk_sh0(scene: Scene, support: Float[Tensor, "n"]) -> Float[Tensor, "n 1 
 
     Args:
         scene: on the processor.
-        support: sum of `colour_support` over the training views.
+        support: sum of `color_support` over the training views.
 
     Raises:
         ShapeError: when there is not one value for each Gaussian.

@@ -157,9 +157,9 @@ def check(given: argparse.Namespace) -> int:
             for note in found.notes:
                 out.print(f"  note: {escape(note)}", soft_wrap=True)
             for finding in found.findings:
-                colour = "red" if finding.kind == "error" else "yellow"
+                color = "red" if finding.kind == "error" else "yellow"
                 out.print(
-                    f"  [{colour}]{finding.kind}[/] {escape(finding.topic)}: {escape(str(finding))}",
+                    f"  [{color}]{finding.kind}[/] {escape(finding.topic)}: {escape(str(finding))}",
                     soft_wrap=True,
                 )
             if found.facts is not None:
@@ -181,9 +181,10 @@ def _known(name: str) -> Descriptor | None:
 
 
 def _ingest(given: argparse.Namespace) -> IngestConfig:
+    from extrags.config import DEFAULT_PROFILE
     from flows.settings import pipeline_config
 
-    return pipeline_config("balanced", given.settings).ingest
+    return pipeline_config(DEFAULT_PROFILE, given.settings).ingest
 
 
 def _write_picture(sequence: EndoscopicSequence, target: Path) -> None:

@@ -37,6 +37,7 @@ __all__ = [
 ]
 
 DEFAULT_PROFILE = "balanced"
+"""That of `extrags.config`, which takes long to load."""
 
 SHORT_NAMES = {"--scale": "ingest.scale_mm_per_unit"}
 """Settings with a flag of their own beside that of their name."""

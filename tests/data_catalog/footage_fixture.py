@@ -114,8 +114,8 @@ def write_ten_bit(file: Path, frames: np.ndarray, *, pixel_aspect: str = "1:1") 
             red, green, blue = np.moveaxis(frame.astype(float) / 255, -1, 0)
             luma = 0.299 * red + 0.587 * green + 0.114 * blue
             planes = [64 + 876 * luma]
-            for colour, scale in ((blue, 1.772), (red, 1.402)):
-                chroma = 512 + 896 * (colour - luma) / scale
+            for color, scale in ((blue, 1.772), (red, 1.402)):
+                chroma = 512 + 896 * (color - luma) / scale
                 planes.append(chroma.reshape(height // 2, 2, width // 2, 2).mean(axis=(1, 3)))
             stream.write(b"FRAME\n")
             stream.writelines(np.rint(plane).astype("<u2").tobytes() for plane in planes)
@@ -164,7 +164,7 @@ def write_dicom(
     file: Path,
     frames: np.ndarray,
     *,
-    colours: str = "RGB",
+    colors: str = "RGB",
     jpeg: bool = False,
     stream: bytes | None = None,
     bits: int = 8,
@@ -175,7 +175,7 @@ def write_dicom(
     Args:
         file: to write.
         frames: [F, h, w, 3], or grey [F, h, w].
-        colours: photometric interpretation; the values are converted.
+        colors: photometric interpretation; the values are converted.
         jpeg: compressed frame by frame; else as they are.
         stream: a whole video in place of frames.
         bits: stored of 8 or 16.
@@ -194,7 +194,7 @@ def write_dicom(
     dataset.PatientName = "Doe^Jane"
     dataset.NumberOfFrames, dataset.Rows, dataset.Columns = frames.shape[:3]
     dataset.SamplesPerPixel = 3 if frames.ndim == 4 else 1
-    dataset.PhotometricInterpretation = colours
+    dataset.PhotometricInterpretation = colors
     dataset.BitsStored = bits
     dataset.BitsAllocated = 8 if bits <= 8 else 16
     dataset.HighBit = bits - 1
@@ -208,8 +208,8 @@ def write_dicom(
     elif jpeg:
         dataset.PixelData = encapsulate([_jpeg(frame) for frame in frames])
     else:
-        values = frames if colours in ("RGB", "MONOCHROME2") else np.stack([_ybr(frame) for frame in frames])
-        if colours == "YBR_FULL_422":
+        values = frames if colors in ("RGB", "MONOCHROME2") else np.stack([_ybr(frame) for frame in frames])
+        if colors == "YBR_FULL_422":
             values = np.stack(
                 [values[:, :, ::2, 0], values[:, :, 1::2, 0], values[:, :, ::2, 1], values[:, :, ::2, 2]], -1
             )

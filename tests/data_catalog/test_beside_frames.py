@@ -31,7 +31,7 @@ def names_of_frames(*names: str) -> list[str]:
 
 class TestPicturesOfAnotherKind:
     @pytest.mark.parametrize(
-        ("colour", "other"),
+        ("color", "other"),
         [
             ("{:04d}_color.png", "{:04d}_depth.png"),
             ("{:04d}.png", "{:04d}_mask.png"),
@@ -43,8 +43,8 @@ class TestPicturesOfAnotherKind:
             ("frame-{:06d}.color.jpg", "frame-{:06d}.SEG.png"),
         ],
     )
-    def test_those_of_the_same_numbers(self, colour, other) -> None:
-        frames = [colour.format(k) for k in range(6)]
+    def test_those_of_the_same_numbers(self, color, other) -> None:
+        frames = [color.format(k) for k in range(6)]
         assert names_of_frames(*frames, *(other.format(k) for k in range(6))) == frames
         # Of a frame that is missing, the mask is none either.
         assert names_of_frames(*frames[:4], *(other.format(k) for k in range(6))) == frames[:4]

@@ -138,7 +138,7 @@ class TestPinhole:
         """
         plan = PinholeResampling.planned(CALIBRATIONS[name].scaled(675, 540), IngestConfig(width=width))
         fisheye = np.rint(pattern(lens_rays(scaled_lens(name, 675), 675, 540))).astype(np.uint8)
-        found = plan.colour(fisheye).astype(np.float64)
+        found = plan.color(fisheye).astype(np.float64)
         fine = pattern(pinhole_rays(plan.K, plan.width, plan.height, 4))
         expected = fine.reshape(plan.height, 4, plan.width, 4, 3).mean(axis=(1, 3))
         assert np.abs(found - expected).max() < 4
@@ -189,7 +189,7 @@ class TestPinhole:
     def test_fine_detail_is_averaged_not_aliased(self) -> None:
         checks = (np.indices((540, 675)).sum(axis=0) % 2 * 200 + 20).astype(np.uint8)
         plan = PinholeResampling.planned(CALIBRATIONS["c3vdv2"].scaled(675, 540), IngestConfig(width=160))
-        small = plan.colour(np.repeat(checks[..., None], 3, axis=2)).astype(float)
+        small = plan.color(np.repeat(checks[..., None], 3, axis=2)).astype(float)
         assert abs(small.mean() - 120) < 2
         assert small.std() < 12
 
@@ -230,7 +230,7 @@ class TestPinhole:
         image = np.where(mask[..., None], 200, 0).astype(np.uint8).repeat(3, axis=2)
         kept = plan.mask(mask)
         assert kept.mean() > 0.2
-        assert (plan.colour(image)[kept] == 200).all()
+        assert (plan.color(image)[kept] == 200).all()
 
     @pytest.mark.parametrize(
         ("settings", "message"),
@@ -243,4 +243,4 @@ class TestPinhole:
     def test_image_of_another_size(self) -> None:
         plan = PinholeResampling.planned(CALIBRATIONS["c3vdv2"].scaled(675, 540), IngestConfig(width=64))
         with pytest.raises(SourceError, match=r"frame 7, field rgb: 64 x 64 pixels; expected 675 x 540"):
-            plan.colour(np.zeros((64, 64, 3), np.uint8), frame=7)
+            plan.color(np.zeros((64, 64, 3), np.uint8), frame=7)

@@ -373,7 +373,7 @@ def simulated(shared_data: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def simulated_sparse(simulated: Path) -> EndoscopicSequence:
-    return read(f"{SCENE}@sparse")
+    return read(f"{SCENE}@sparse", IngestConfig(size="thumbnail"))
 
 
 class TestSimulatedSet:
@@ -451,7 +451,7 @@ class TestSimulatedSet:
             return 128 + 100 * np.sin(points @ waves.T), distance
 
         fisheye, _ = seen(lens_rays(scaled_lens("c3vdv2", 675), 675, 540))
-        found = plan.colour(np.rint(fisheye).astype(np.uint8)).astype(float)
+        found = plan.color(np.rint(fisheye).astype(np.uint8)).astype(float)
         u, v = ((np.arange(size * 4) + 0.5) / 4 for size in (plan.width, plan.height))
         x, y = np.meshgrid((u - plan.K[0, 2]) / plan.K[0, 0], (v - plan.K[1, 2]) / plan.K[1, 1])
         fine, depth = seen(np.stack([x, y, np.ones_like(x)], -1))

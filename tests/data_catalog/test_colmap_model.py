@@ -343,9 +343,9 @@ class TestNames:
 
 class TestPoints:
     def test_depth_gives_points_where_there_are_none(self, clip) -> None:
-        points, colours = points_of(clip, at_most=500)
+        points, colors = points_of(clip, at_most=500)
         assert 200 < len(points) <= 700
-        assert colours.shape == points.shape
+        assert colors.shape == points.shape
         viewmat = clip.cameras.viewmats[1]
         assert ((points @ viewmat[:3, :3].T + viewmat[:3, 3])[:, 2] > 0).mean() > 0.5
 

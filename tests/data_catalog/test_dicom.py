@@ -30,7 +30,7 @@ def decoded(file: Path) -> np.ndarray:
 
 class TestPixels:
     @pytest.mark.parametrize(
-        ("colours", "jpeg", "tolerance"),
+        ("colors", "jpeg", "tolerance"),
         [
             ("RGB", False, 0),
             ("YBR_FULL", False, 2),
@@ -39,24 +39,24 @@ class TestPixels:
             ("YBR_FULL_422", True, 12),
         ],
     )
-    def test_colours(self, scene, tmp_path, colours, jpeg, tolerance) -> None:
-        file = write_dicom(tmp_path / "a.dcm", scene[:3], colours=colours, jpeg=jpeg)
+    def test_colours(self, scene, tmp_path, colors, jpeg, tolerance) -> None:
+        file = write_dicom(tmp_path / "a.dcm", scene[:3], colors=colors, jpeg=jpeg)
         difference = np.abs(decoded(file).astype(int) - scene[:3])
         assert np.percentile(difference, 95) <= tolerance
 
     def test_grey(self, scene, tmp_path) -> None:
         grey = scene[:3, :, :, 1]
-        file = write_dicom(tmp_path / "a.dcm", grey, colours="MONOCHROME2")
+        file = write_dicom(tmp_path / "a.dcm", grey, colors="MONOCHROME2")
         np.testing.assert_array_equal(decoded(file), np.repeat(grey[..., None], 3, axis=3))
 
     def test_of_more_bits_the_highest_eight(self, scene, tmp_path) -> None:
         grey = scene[:3, :, :, 1].astype(np.uint16) * 16 + 7
-        file = write_dicom(tmp_path / "a.dcm", grey, colours="MONOCHROME2", bits=12)
+        file = write_dicom(tmp_path / "a.dcm", grey, colors="MONOCHROME2", bits=12)
         np.testing.assert_array_equal(decoded(file)[..., 0], scene[:3, :, :, 1])
 
     def test_a_video_stream_inside(self, scene, tmp_path) -> None:
         video = write_video(tmp_path / "a.mp4", scene, "mp4v")
-        file = write_dicom(tmp_path / "a.dcm", scene, colours="YBR_PARTIAL_420", stream=video.read_bytes())
+        file = write_dicom(tmp_path / "a.dcm", scene, colors="YBR_PARTIAL_420", stream=video.read_bytes())
         video.unlink()
         footage = open_dicom(file)
         assert (footage.announced, footage.file) == (12, file)
@@ -123,7 +123,7 @@ class TestRefused:
             read(file)
 
     def test_other_colours(self, scene, tmp_path) -> None:
-        file = write_dicom(tmp_path / "a.dcm", scene[..., 0], colours="MONOCHROME2")
+        file = write_dicom(tmp_path / "a.dcm", scene[..., 0], colors="MONOCHROME2")
         content = file.read_bytes().replace(b"MONOCHROME2 ", b"PALETTE COL ")
         file.write_bytes(content)
         with pytest.raises(
@@ -132,7 +132,7 @@ class TestRefused:
             read(file)
 
     def test_a_compression_that_nothing_here_decodes(self, scene, tmp_path) -> None:
-        file = write_dicom(tmp_path / "a.dcm", scene, jpeg=True, colours="YBR_FULL")
+        file = write_dicom(tmp_path / "a.dcm", scene, jpeg=True, colors="YBR_FULL")
         # JPEG-LS, of the same length as JPEG baseline.
         file.write_bytes(file.read_bytes().replace(b"1.2.840.10008.1.2.4.50", b"1.2.840.10008.1.2.4.80"))
         with pytest.raises(SourceError, match=r"a\.dcm.*Unable to decompress"):
@@ -141,7 +141,7 @@ class TestRefused:
     @pytest.mark.parametrize("share", [0.02, 0.5, 0.9])
     @pytest.mark.parametrize("jpeg", [False, True])
     def test_a_truncated_file(self, scene, tmp_path, share, jpeg) -> None:
-        file = write_dicom(tmp_path / "a.dcm", scene, jpeg=jpeg, colours="YBR_FULL" if jpeg else "RGB")
+        file = write_dicom(tmp_path / "a.dcm", scene, jpeg=jpeg, colors="YBR_FULL" if jpeg else "RGB")
         file.write_bytes(file.read_bytes()[: int(share * file.stat().st_size)])
         with pytest.raises(SourceError, match=r"a\.dcm"):
             read(file)

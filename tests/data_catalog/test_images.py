@@ -13,12 +13,12 @@ from PIL import Image
 from data_catalog.image_pages import pages_in
 from data_catalog.images import (
     UPRIGHT,
-    colour_files,
+    color_files,
     file_key,
     natural_key,
     order_for_fingerprint,
     orientation,
-    read_colour,
+    read_color,
     read_depth,
     read_mask,
     spread,
@@ -36,7 +36,7 @@ def written(file: Path, pixels: np.ndarray) -> Path:
 @pytest.mark.parametrize("name", ["a.png", "a.tif"])
 class TestSixteenBits:
     def test_grey_is_the_high_byte(self, tmp_path: Path, name: str) -> None:
-        found = read_colour(written(tmp_path / name, GREY))
+        found = read_color(written(tmp_path / name, GREY))
         assert found.dtype == np.uint8
         np.testing.assert_array_equal(found, np.repeat((GREY >> 8)[..., None], 3, axis=2))
 
@@ -47,15 +47,15 @@ class TestSixteenBits:
 
 
 def test_colours_of_sixteen_bits_are_the_high_byte(tmp_path: Path) -> None:
-    colours = np.stack([GREY, GREY[::-1], GREY[:, ::-1]], axis=-1)
-    found = read_colour(written(tmp_path / "a.png", colours[..., ::-1]))
-    np.testing.assert_array_equal(found, (colours >> 8).astype(np.uint8))
+    colors = np.stack([GREY, GREY[::-1], GREY[:, ::-1]], axis=-1)
+    found = read_color(written(tmp_path / "a.png", colors[..., ::-1]))
+    np.testing.assert_array_equal(found, (colors >> 8).astype(np.uint8))
 
 
 def test_alpha_is_dropped(tmp_path: Path) -> None:
-    colours = np.random.default_rng(1).integers(0, 256, (20, 30, 4), dtype=np.uint8)
-    found = read_colour(written(tmp_path / "a.png", colours))
-    np.testing.assert_array_equal(found, colours[..., 2::-1])
+    colors = np.random.default_rng(1).integers(0, 256, (20, 30, 4), dtype=np.uint8)
+    found = read_color(written(tmp_path / "a.png", colors))
+    np.testing.assert_array_equal(found, colors[..., 2::-1])
 
 
 class TestOrientation:
@@ -63,12 +63,12 @@ class TestOrientation:
     def test_pixels_are_as_they_are_stored(self, tmp_path: Path, name: str) -> None:
         file = self.tagged(tmp_path / name)
         assert orientation(file) == 6
-        assert read_colour(file).shape == (20, 30, 3)
+        assert read_color(file).shape == (20, 30, 3)
 
     def test_a_tiff_is_upright_once_it_is_read(self, tmp_path: Path) -> None:
         file = self.tagged(tmp_path / "a.tif")
         assert orientation(file) == UPRIGHT
-        assert read_colour(file).shape == (30, 20, 3)
+        assert read_color(file).shape == (30, 20, 3)
 
     @pytest.mark.parametrize("tag", [1, 0, 9, None])
     def test_upright(self, tmp_path: Path, tag: int | None) -> None:
@@ -93,7 +93,7 @@ class TestOrientation:
 def test_floating_point_has_no_white(tmp_path: Path) -> None:
     file = written(tmp_path / "a.tif", GREY.astype(np.float32))
     with pytest.raises(SourceError, match=r"a\.tif, frame 7, field rgb: floating-point values; expected"):
-        read_colour(file, frame=7)
+        read_color(file, frame=7)
 
 
 def test_a_tiff_that_is_not_read_is_not_said_to_be_no_image(tmp_path: Path) -> None:
@@ -115,12 +115,12 @@ def test_depth_of_another_format_is_said_to_be_that(tmp_path: Path, name: str) -
 
 
 def test_webp_is_read(tmp_path: Path) -> None:
-    colours = np.random.default_rng(1).integers(0, 256, (20, 30, 3), dtype=np.uint8)
-    Image.fromarray(colours).save(tmp_path / "a.webp", lossless=True)
-    np.testing.assert_array_equal(read_colour(tmp_path / "a.webp"), colours)
-    assert [file.name for file in colour_files(tmp_path)] == ["a.webp"]
+    colors = np.random.default_rng(1).integers(0, 256, (20, 30, 3), dtype=np.uint8)
+    Image.fromarray(colors).save(tmp_path / "a.webp", lossless=True)
+    np.testing.assert_array_equal(read_color(tmp_path / "a.webp"), colors)
+    assert [file.name for file in color_files(tmp_path)] == ["a.webp"]
     Image.fromarray(np.full((20, 30, 3), 90, np.uint8)).save(tmp_path / "b.webp", quality=80)
-    assert np.abs(read_colour(tmp_path / "b.webp").astype(int) - 90).max() < 4
+    assert np.abs(read_color(tmp_path / "b.webp").astype(int) - 90).max() < 4
 
 
 @pytest.mark.parametrize("name", ["a.tif", "a.webp", "a.png"])
@@ -139,10 +139,10 @@ class TestDepthOfAPalette:
 
     VALUES = np.array([[0, 40, 200], [200, 7, 40]], np.uint8)
 
-    def written(self, file: Path, colours: np.ndarray) -> Path:
+    def written(self, file: Path, colors: np.ndarray) -> Path:
         places = np.searchsorted(np.unique(self.VALUES), self.VALUES).astype(np.uint8)
         image = Image.fromarray(places, mode="P")
-        image.putpalette(colours.astype(np.uint8).tobytes())
+        image.putpalette(colors.astype(np.uint8).tobytes())
         image.save(file)
         return file
 
@@ -153,8 +153,8 @@ class TestDepthOfAPalette:
         np.testing.assert_array_equal(found, self.VALUES)
 
     def test_colours_are_refused(self, tmp_path: Path) -> None:
-        colours = np.array([[0, 0, 0], [255, 0, 0], [0, 255, 0], [0, 0, 255]])
-        file = self.written(tmp_path / "a.png", colours)
+        colors = np.array([[0, 0, 0], [255, 0, 0], [0, 255, 0], [0, 0, 255]])
+        file = self.written(tmp_path / "a.png", colors)
         with pytest.raises(SourceError, match=r"a\.png, frame 3, field depth: colours of a palette"):
             read_depth(file, frame=3)
 
@@ -174,7 +174,7 @@ def test_a_tiff_tells_how_many_of_sixteen_bits_it_uses(tmp_path: Path) -> None:
         )
     file = tmp_path / "a.tif"
     file.write_bytes(b"II*\0" + struct.pack("<I", 8 + len(packed)) + packed + directory + bytes(4))
-    np.testing.assert_array_equal(read_colour(file)[0, :, 0], [0, 128, 255, 1])
+    np.testing.assert_array_equal(read_color(file)[0, :, 0], [0, 128, 255, 1])
 
 
 class TestMasks:

@@ -197,7 +197,7 @@ class TestPoseSupport:
     def test_real_images(self, shared_data) -> None:
         from data_catalog.catalog import read
 
-        sequence = read(shared_data / "sinus_hopkins")
+        sequence = read(shared_data / "sinus_hopkins", IngestConfig(size="thumbnail"))
         support = pose_support(sequence, match_neighbours(sequence))
         assert support.as_given > 0.82
         assert support.best_name == ""

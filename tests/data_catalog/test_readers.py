@@ -41,7 +41,7 @@ class TestSinus:
         assert inside >= 6580
 
     def test_shape_and_split(self, shared_data) -> None:
-        sequence = read(shared_data / "sinus_hopkins")
+        sequence = read(shared_data / "sinus_hopkins", IngestConfig(size="thumbnail"))
         assert sequence.rgb.shape == (35, 243, 262, 3)
         assert sequence.test.tolist() == [0, 8, 16, 24, 32]
         assert sequence.metric is False

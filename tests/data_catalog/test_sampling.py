@@ -27,7 +27,7 @@ def test_a_pinhole_beside_a_lens_whose_pinhole_grows() -> None:
 
 def test_the_grown_pinhole_shows_frames() -> None:
     sampling = LensSampling.planned(DISTORTED, GROWN, None)
-    shown = sampling.colour(np.full((64, 96, 3), 200, np.uint8))
+    shown = sampling.color(np.full((64, 96, 3), 200, np.uint8))
     assert shown.shape == (127, 191, 3)
     assert (shown[60:67, 90:100] == 200).all()
 

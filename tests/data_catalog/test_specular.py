@@ -9,6 +9,7 @@ from PIL import Image
 
 from data_catalog.catalog import read
 from data_catalog.specular import specular_mask, specular_masks, with_specular
+from extrags.config import IngestConfig
 from extrags.sequence import saturated_mask
 
 
@@ -19,8 +20,8 @@ def mucosa(width: int = 320, height: int = 256) -> np.ndarray:
     light = 0.9 - 0.5 * np.hypot(x - 0.3, y - 0.3)
     vessels = 1 - 0.2 * (np.abs(np.sin(18 * x + 4 * np.sin(9 * y))) < 0.12)
     lumen = np.where(np.hypot(x - 0.7, y - 0.5) < 0.15, 0.15, 1.0)
-    colour = np.array([215, 120, 95])
-    image = (light * vessels * lumen)[..., None] * colour + rng.normal(0, 2, (height, width, 3))
+    color = np.array([215, 120, 95])
+    image = (light * vessels * lumen)[..., None] * color + rng.normal(0, 2, (height, width, 3))
     return np.clip(image, 0, 255).astype(np.uint8)
 
 
@@ -83,7 +84,7 @@ def test_a_sequence_gets_its_highlights_and_keeps_them(clip, tmp_path) -> None:
 
 class TestRealImages:
     def test_sinus_shows_one_bright_reflex(self, shared_data) -> None:
-        sequence = read(shared_data / "sinus_hopkins")
+        sequence = read(shared_data / "sinus_hopkins", IngestConfig(size="thumbnail"))
         found = specular_masks(sequence.rgb, sequence.mask)
         share = found[sequence.mask].mean()
         assert 0.001 < share < 0.02

@@ -187,12 +187,12 @@ class TestReading:
         assert found.depth_mm is None
         assert found.points is None
 
-    @pytest.mark.parametrize("coloured", [True, False])
-    def test_points_that_are_not_finite_are_left_out(self, folder, edit, caplog, coloured) -> None:
+    @pytest.mark.parametrize("colored", [True, False])
+    def test_points_that_are_not_finite_are_left_out(self, folder, edit, caplog, colored) -> None:
         kinds = [*((axis, "f4") for axis in "xyz"), *((c, "u1") for c in ("red", "green", "blue"))]
-        rows = np.zeros(20, dtype=kinds if coloured else kinds[:3])
+        rows = np.zeros(20, dtype=kinds if colored else kinds[:3])
         rows["x"] = np.arange(20)
-        if coloured:
+        if colored:
             rows["red"] = np.arange(20)
         rows["y"][::10], rows["z"][5] = np.nan, np.inf
         PlyData([PlyElement.describe(rows, "vertex")]).write(str(folder / "points.ply"))
@@ -200,8 +200,8 @@ class TestReading:
         back = read(folder)
         kept = [index for index in range(20) if index not in (0, 5, 10)]
         assert back.points[:, 0].tolist() == kept
-        assert (back.points_rgb is not None) == coloured
-        if coloured:
+        assert (back.points_rgb is not None) == colored
+        if colored:
             assert back.points_rgb[:, 0].tolist() == kept
         assert "points.ply: 3 of 20 points are not finite and left out" in caplog.text
         rows["x"] = np.nan

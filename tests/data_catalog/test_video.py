@@ -15,7 +15,7 @@ import pytest
 from data_catalog.catalog import read, resolve, source_fingerprint
 from data_catalog.footage import FootageFrame, TimeSpan
 from data_catalog.readers.footage_frames import footage_frames
-from data_catalog.readers.video import VideoFile, _colours
+from data_catalog.readers.video import VideoFile, _colors
 from data_catalog.survey import Survey, choose_frames, survey
 from extrags.config import IngestConfig
 from extrags.errors import ConfigError, SourceError
@@ -97,26 +97,26 @@ class TestColours:
     )
     def test_what_was_written_is_read(self, tmp_path, size, matrix, named) -> None:
         file = tmp_path / "a.mp4"
-        colour = np.array((200, 80, 60), np.uint8)
+        color = np.array((200, 80, 60), np.uint8)
         with av.open(str(file), "w") as container:
             stream = container.add_stream("libx264", rate=25, options={"crf": "5"})
             stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
             if named:
                 stream.codec_context.colorspace, stream.codec_context.color_range = matrix, 1
-            picture = av.VideoFrame.from_ndarray(np.full((*size[::-1], 3), colour), format="rgb24")
+            picture = av.VideoFrame.from_ndarray(np.full((*size[::-1], 3), color), format="rgb24")
             coded = picture.reformat(format="yuv420p", dst_colorspace=matrix, dst_color_range=1)
             for packet in [*stream.encode(coded), *stream.encode(None)]:
                 container.mux(packet)
         (found,) = VideoFile(file).frames(TimeSpan())
         # Eight bits of luminance and chrominance.
-        assert np.abs(found.rgb.astype(int) - colour).max() <= 3
+        assert np.abs(found.rgb.astype(int) - color).max() <= 3
 
     @pytest.mark.parametrize("color_range", [1, 2], ids=["limited", "full"])
     @pytest.mark.parametrize(("pixel_format", "step"), [("yuv420p", 1), ("yuv422p", 1), ("yuv420p10le", 4)])
     def test_greys_are_rounded_to_the_nearest(self, color_range, pixel_format, step) -> None:
         """FFmpeg's own choice makes limited ranges up to 1/255 too dark, and those of 10 bits 2/255."""
         levels = range(16, 236)
-        found = [_colours(grey(level * step, 128 * step, pixel_format, color_range)) for level in levels]
+        found = [_colors(grey(level * step, 128 * step, pixel_format, color_range)) for level in levels]
         told = np.array(levels) if color_range == 2 else 255 * (np.array(levels) - 16) / 219
         assert np.abs(np.array(found) - told[:, None, None, None]).max() <= 0.51
 
@@ -135,7 +135,7 @@ class TestColours:
             padded = np.pad(small, ((0, 0), (0, plane.line_size - plane.width)))
             plane.update(np.rint(padded).astype(np.uint8).tobytes())
         frame.color_range, frame.colorspace = color_range, 1
-        error = _colours(frame) - scene
+        error = _colors(frame) - scene
         assert np.abs(error.mean(axis=(0, 1))).max() < 0.1
 
 
@@ -425,7 +425,7 @@ class TestShots:
         source = footage_frames(Long(), IngestConfig())
         assert len(source.frames) == 200
         for frame in source.frames:
-            source.read_colour(frame)
+            source.read_color(frame)
         assert most <= 3
 
 

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from data_catalog.catalog import read, resolve, source_fingerprint
-from data_catalog.images import colour_files, read_colour
+from data_catalog.images import color_files, read_color
 from data_catalog.inspection import inspect
 from data_catalog.readers import frames_folder
 from extrags.config import IngestConfig
@@ -157,9 +157,9 @@ def test_each_frame_that_is_kept_is_decoded_once_and_no_other(tmp_path, monkeypa
 
     def noted(file: Path, *, frame: object = None) -> np.ndarray:
         decoded.append(file.name)
-        return read_colour(file, frame=frame)
+        return read_color(file, frame=frame)
 
-    monkeypatch.setattr(frames_folder, "read_colour", noted)
+    monkeypatch.setattr(frames_folder, "read_color", noted)
     assert read(tmp_path, IngestConfig(max_frames=4)).frame_names == ("0000", "0005", "0010", "0015")
     assert decoded == ["0000.png", "0005.png", "0010.png", "0015.png"]
 
@@ -191,7 +191,7 @@ def test_a_link_to_nothing_is_refused(tmp_path) -> None:
     (tmp_path / "elsewhere.dat").write_bytes((tmp_path / "0002.png").read_bytes())
     (tmp_path / "0003.png").unlink()
     (tmp_path / "0003.png").symlink_to(tmp_path / "elsewhere.dat")
-    assert len(colour_files(tmp_path)) == 6
+    assert len(color_files(tmp_path)) == 6
     assert np.array_equal(read(tmp_path).rgb[2], read(tmp_path).rgb[3])
 
 

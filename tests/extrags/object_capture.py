@@ -34,10 +34,10 @@ def write_object_capture(folder: Path, views: int = 12) -> None:
     import open3d as o3d
 
     scene = o3d.t.geometry.RaycastingScene()
-    colours = {}
-    for colour, shape, place in _parts(o3d):
+    colors = {}
+    for color, shape, place in _parts(o3d):
         shape.translate(place)
-        colours[scene.add_triangles(o3d.t.geometry.TriangleMesh.from_legacy(shape))] = colour
+        colors[scene.add_triangles(o3d.t.geometry.TriangleMesh.from_legacy(shape))] = color
     cameras = object_cameras(views)
     rays = pixel_rays(cameras).astype(np.float32)
     (folder / "images").mkdir(parents=True)
@@ -49,8 +49,8 @@ def write_object_capture(folder: Path, views: int = 12) -> None:
         part, normal = hit["geometry_ids"].numpy(), hit["primitive_normals"].numpy()
         light = 0.55 + 0.45 * np.abs(normal @ np.array([0.4, 0.3, 0.86]))
         image = np.tile(np.array(BACKGROUND, dtype=np.float64), (len(flat), 1))
-        for number, colour in colours.items():
-            image[part == number] = np.array(colour) * light[part == number, None]
+        for number, color in colors.items():
+            image[part == number] = np.array(color) * light[part == number, None]
         name = f"images/r_{index:02d}.png"
         Image.fromarray(image.reshape(SIZE[1], SIZE[0], 3).clip(0, 255).astype(np.uint8)).save(folder / name)
         pose = cameras.world_from_camera[index] @ np.diag([1.0, -1.0, -1.0, 1.0])

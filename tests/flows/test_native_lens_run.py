@@ -26,7 +26,7 @@ def _through_the_lens(flat: EndoscopicSequence) -> EndoscopicSequence:
     assert flat.observed is not None
     return replace(
         flat,
-        rgb=np.stack([plan.colour(image) for image in flat.rgb]),
+        rgb=np.stack([plan.color(image) for image in flat.rgb]),
         K=K,
         mask=np.stack([plan.mask(mask) for mask in flat.mask]),
         depth_mm=np.stack([plan.depth(depth) for depth in flat.depth_mm]),

@@ -9,8 +9,9 @@ from typing import Any
 
 import pytest
 
-from extrags.config import PipelineConfig
+from extrags.config import DEFAULT_PROFILE, PipelineConfig
 from flows.cli import VERBS, main, parser
+from flows.commands import options
 from flows.commands.options import Parser, add_settings
 
 
@@ -94,3 +95,7 @@ def test_the_output_has_one_spelling_that_is_shown_and_another_that_is_understoo
     assert isinstance(verbs.choices, dict)
     for option in ("-o", "--output", "--out"):
         assert verbs.choices["export"].parse_args(["phantom/0@sparse", option, "x.ply"]).output == "x.ply"
+
+
+def test_the_default_profile_is_that_of_the_library() -> None:
+    assert options.DEFAULT_PROFILE == DEFAULT_PROFILE

@@ -230,7 +230,7 @@ class _Training:
         column, row = pixels.long().unbind(dim=1)
         weight = view.weights[row, column]
         assert found.rgb is not None
-        squares = (found.rgb[: len(pixels)] - view.colours[row, column]).square().mean(dim=1)
+        squares = (found.rgb[: len(pixels)] - view.colors[row, column]).square().mean(dim=1)
         squared = (squares * weight).sum() / weight.sum().clamp_min(1)
 
         confidence = 1 - guide[2]
@@ -246,7 +246,7 @@ class _Training:
             + (confidence * (found.depth - 1 / guide[0]).abs() / scene.scale).mean()
         )
         mask = self.images.mask
-        shown = view.colours if mask is None else view.colours * mask[frame, ..., None]
+        shown = view.colors if mask is None else view.colors * mask[frame, ..., None]
         loss = loss + config.smoothness_weight * edge_aware_smoothness(
             prior.inverse * scene.scale, _resized(shown, prior.inverse)
         )

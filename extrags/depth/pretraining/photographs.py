@@ -63,20 +63,20 @@ class _Mucosa:
         self.mottle_strength = [uniform(0.0, 0.12, c, 1) * uniform(0.0, 1.0, c, 1) for _ in range(2)]
         self.relief = Waves.random(generator, c, 15.0, 60.0, slope=0.8, waves=24)
         self.relief_strength = uniform(0.0, 0.35, c, 1)
-        self.rod_colour = uniform(0.2, 0.6, c, 1).expand(c, 3)
+        self.rod_color = uniform(0.2, 0.6, c, 1).expand(c, 3)
 
     def albedo(self, points: Tensor) -> Tensor:
-        colour = self.base[:, None] * torch.ones_like(points)
+        color = self.base[:, None] * torch.ones_like(points)
         slow = torch.stack([wave(points) for wave in self.slow], dim=2)
-        colour = colour * torch.exp(self.slow_strength[:, :, None] * (slow[:, :, :1] + 0.4 * slow))
+        color = color * torch.exp(self.slow_strength[:, :, None] * (slow[:, :, :1] + 0.4 * slow))
         absorbed = torch.tensor([0.35, 1.0, 0.8], device=points.device)
         for wave, width, strength in zip(self.vessels, self.vessel_width, self.vessel_strength, strict=True):
             line = torch.exp(-(wave(points) / width).square())
             density = torch.sigmoid(3 * slow[:, :, 1])
-            colour = colour * (1 - (strength * line * density)[:, :, None] * absorbed)
+            color = color * (1 - (strength * line * density)[:, :, None] * absorbed)
         for wave, strength in zip(self.mottle, self.mottle_strength, strict=True):
-            colour = colour * torch.exp((strength * wave(points))[:, :, None] * (0.5 + 0.5 * absorbed))
-        return colour.clamp(0.01, 1.5)
+            color = color * torch.exp((strength * wave(points))[:, :, None] * (0.5 + 0.5 * absorbed))
+        return color.clamp(0.01, 1.5)
 
 
 def photograph(scene: Cavities, generator: torch.Generator, size: tuple[int, int], views: int) -> Clips:
@@ -229,7 +229,7 @@ class _Lamps:
         albedo = mucosa.albedo(at_rest)
         if scene.kind == "field":
             on_rod = scene.on_instruments(points)
-            albedo = torch.where(on_rod[:, :, None], mucosa.rod_colour[:, None], albedo)
+            albedo = torch.where(on_rod[:, :, None], mucosa.rod_color[:, None], albedo)
         to_eye = center[:, None] - points
         distance = to_eye.norm(dim=2, keepdim=True).clamp_min(1e-6)
         to_eye = to_eye / distance

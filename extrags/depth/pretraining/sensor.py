@@ -90,10 +90,10 @@ def compressed(images: Float[Tensor, "f 3 h w"], loss: Float[Tensor, "f"]) -> Fl
     order = torch.arange(BLOCK, device=device, dtype=torch.float32)
     basis = torch.cos(math.pi / BLOCK * (order[None] + 0.5) * order[:, None]) * math.sqrt(2 / BLOCK)
     basis[0] = basis[0] / math.sqrt(2)
-    colours = torch.tensor(
+    colors = torch.tensor(
         [[0.299, 0.587, 0.114], [-0.169, -0.331, 0.5], [0.5, -0.419, -0.081]], device=device
     )
-    value = torch.einsum("ij,fjhw->fihw", colours, images)
+    value = torch.einsum("ij,fjhw->fihw", colors, images)
     value = functional.pad(value, (0, -width % BLOCK, 0, -height % BLOCK), mode="replicate")
     blocks = value.unflatten(3, (-1, BLOCK)).unflatten(2, (-1, BLOCK)).transpose(3, 4)
     transformed = basis @ blocks @ basis.T
@@ -102,7 +102,7 @@ def compressed(images: Float[Tensor, "f 3 h w"], loss: Float[Tensor, "f"]) -> Fl
     step = step * loss.clamp_min(1e-6)[:, None, None, None, None, None]
     restored = basis.T @ (torch.round(transformed / step) * step) @ basis
     value = restored.transpose(3, 4).flatten(4, 5).flatten(2, 3)[:, :, :height, :width]
-    result = torch.einsum("ij,fjhw->fihw", torch.linalg.inv(colours), value)
+    result = torch.einsum("ij,fjhw->fihw", torch.linalg.inv(colors), value)
     chosen: Tensor = torch.where(loss[:, None, None, None] > 0, result, images)
     return chosen
 

@@ -106,9 +106,9 @@ class ExampleBank:
             channels = torch.cat(
                 [channels[:, : RAYS.start], channels[:, RAYS].flip(1), channels[:, RAYS.stop :]], dim=1
             )
-        return self._recoloured(channels).contiguous(), truth.contiguous(), known.contiguous()
+        return self._recolored(channels).contiguous(), truth.contiguous(), known.contiguous()
 
-    def _recoloured(self, channels: Tensor) -> Tensor:
+    def _recolored(self, channels: Tensor) -> Tensor:
         n, device = len(channels), channels.device
 
         def uniform(low: float, high: float, *shape: int) -> Tensor:

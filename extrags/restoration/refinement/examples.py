@@ -33,7 +33,7 @@ CROP_TRIALS = 6
 LARGEST_ZOOM = 2.0
 ZOOMED = 0.4
 """Share of crops that are enlarged, so that pictures of many pixels are not a world of their own."""
-EXPOSURE_JITTER, COLOUR_JITTER = 0.25, 0.08
+EXPOSURE_JITTER, COLOR_JITTER = 0.25, 0.08
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ class ExampleCrops:
             )
             # A pixel shows less of the surface.
             crop[:, 10] *= side / self._wanted
-        gains = np.exp(generator.normal(0, EXPOSURE_JITTER) + generator.normal(0, COLOUR_JITTER, 3))
+        gains = np.exp(generator.normal(0, EXPOSURE_JITTER) + generator.normal(0, COLOR_JITTER, 3))
         gain = torch.from_numpy(gains.astype(np.float32))[None, :, None, None]
         for first in (0, 3, 11):
             crop[:, first : first + 3] *= gain

@@ -42,7 +42,7 @@ __all__ = [
     "REFINER_WIDTHS",
     "WEIGHTS",
     "Refiner",
-    "refined_colours",
+    "refined_colors",
     "refiner_conditioning",
     "relative_depth",
     "textured_views",
@@ -97,7 +97,7 @@ def refiner_conditioning(
     return Conditioning(torch.cat(channels, dim=1), (rgb + laid.change).clamp(0, 1), depth)
 
 
-def refined_colours(
+def refined_colors(
     network: RestorationNetwork,
     conditioning: Conditioning,
     laid: LaidTexture,
@@ -117,8 +117,8 @@ def refined_colours(
     with torch.autocast(base.device.type, torch.bfloat16, enabled=half_precision):
         # The laid texture takes the place of the noise: it is what is drawn.
         answer: Tensor = network(conditioning.channels, laid.change / COLOR_SCALE, time)
-    colour, rest = answer.float().split((3, 2), dim=1)
-    return base + laid.share * COLOR_SCALE * colour, rest
+    color, rest = answer.float().split((3, 2), dim=1)
+    return base + laid.share * COLOR_SCALE * color, rest
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,7 @@ class Refiner:
                     weights[place] += ramp
             found = total / weights
             index = slice(view, view + 1)
-            kept = _with_coarse_colours(found, rgb[index], laid.share[index])
+            kept = _with_coarse_colors(found, rgb[index], laid.share[index])
             # Not a bit of what is known goes through the weights of tiles.
             return torch.where(laid.share[view] > 0, kept, rgb[view]).clamp(0, 1)
 
@@ -186,7 +186,7 @@ class Refiner:
         laid = LaidTexture(change, share, facing, texels)
         with torch.no_grad():
             conditioning = refiner_conditioning(rgb, laid, depth, unknown)
-            found, _ = refined_colours(self.network, conditioning, laid, half_precision=self.half_precision)
+            found, _ = refined_colors(self.network, conditioning, laid, half_precision=self.half_precision)
         return found
 
     def save(self, path: Path) -> None:
@@ -234,7 +234,7 @@ class Refiner:
         return cls(network.eval(), record, half_precision=half_precision)
 
 
-def _with_coarse_colours(
+def _with_coarse_colors(
     refined: Float[Tensor, "1 3 h w"], rgb: Float[Tensor, "1 3 h w"], share: Float[Tensor, "1 1 h w"]
 ) -> Float[Tensor, "1 3 h w"]:
     """Refined views whose means over wide areas are those of the smooth ones.

@@ -25,7 +25,7 @@ from extrags.restoration.refinement.refiner import (
     REFINER_CHANNELS,
     REFINER_WIDTHS,
     Refiner,
-    refined_colours,
+    refined_colors,
 )
 from extrags.restoration.surface_texture import LaidTexture
 from extrags.restoration.training_data.augmentation import Batch
@@ -61,7 +61,7 @@ class _RefinerTraining(NetworkTraining):
 
     def _predicted(self, batch: Batch, *, drawing: bool) -> Predicted:
         assert isinstance(batch, RefinerBatch)
-        rgb, rest = refined_colours(
+        rgb, rest = refined_colors(
             self.network, batch.conditioning, batch.laid, half_precision=self.settings.half_precision
         )
         depth, error = rest.split((1, 1), dim=1)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from extrags.depth import matching, stereo
+from extrags.depth import matching, sweeps
 
 NO_CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no CUDA device")
 
@@ -21,4 +21,4 @@ def device(request: pytest.FixtureRequest) -> str:
 @pytest.fixture
 def specification(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
     """Call it: from then on the processor, too, does what a GPU does."""
-    return lambda: monkeypatch.setattr(stereo, "native", matching)
+    return lambda: monkeypatch.setattr(sweeps, "native", matching)

@@ -223,15 +223,15 @@ def test_rods_are_of_one_colour_all_over(monkeypatch: pytest.MonkeyPatch) -> Non
     light = lamps.radiance(scene, mucosa, points, poses[:, :3, :3], poses[:, :3, 3])[:, :, 0]
     sun = torch.nn.functional.normalize(lamps.sun, dim=1)[:, None]
     facing = (photographs._normal(scene, points) * sun).sum(2)
-    colour = light / (0.6 + 0.4 * facing)
+    color = light / (0.6 + 0.4 * facing)
     # Without its rods a scene is free where they were.
     tissue = without_rods(scene)
     rod = hit & (tissue.clearance(points) > 1e-3)
     assert int(rod.sum()) > 1000
-    wrong = (colour - mucosa.rod_colour[:, :1]).abs() > 1e-3
+    wrong = (color - mucosa.rod_color[:, :1]).abs() > 1e-3
     assert not wrong[rod].any()
     on_tissue = hit & (tissue.clearance(points) < 1e-4)
-    assert torch.allclose(colour[on_tissue], torch.tensor(0.99), atol=1e-3)
+    assert torch.allclose(color[on_tissue], torch.tensor(0.99), atol=1e-3)
 
 
 def without_rods(scene: Cavities) -> Cavities:

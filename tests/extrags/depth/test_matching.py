@@ -273,7 +273,7 @@ def test_brightness_is_not_fitted_where_it_is_saturated(monkeypatch: pytest.Monk
         asked.append(sure)
         return fit_shading(brightness, log_depth, sure, recording)
 
-    monkeypatch.setattr("extrags.depth.stereo.fit_shading", fitted)
+    monkeypatch.setattr("extrags.depth.cues.fit_shading", fitted)
     sources = torch.tensor([[1, 2], [0, 2], [1, 3], [2, 4], [3, 2]])
     near, far = torch.full((5,), 0.8), torch.full((5,), 5.0)
     multi_view_stereo(frames, sources, near, far, StereoSettings(hypotheses=24, radius_px=2))

@@ -9,14 +9,9 @@ import torch
 from jaxtyping import TypeCheckError
 
 from extrags.cameras import Cameras, pixel_rays
-from extrags.config import CoarseConfig, EnhanceConfig, PipelineConfig
-from extrags.config.backends import BACKENDS
 from extrags.errors import CaptureError, ConfigError, ShapeError
 from extrags.metrics.image import MAX_PSNR_DB, psnr, ssim
 from extrags.metrics.lpips import Lpips
-from extrags.metrics.registry import figures
-from extrags.restoration.benchmark import comparison as bench
-from extrags.restoration.benchmark.comparison import bench_enhance, check_methods, compare_methods, prepared
 from extrags.restoration.benchmark.evaluation import (
     RestorerBenchmark,
     TrueViews,
@@ -24,14 +19,11 @@ from extrags.restoration.benchmark.evaluation import (
     restore_views,
 )
 from extrags.restoration.benchmark.inconsistency import view_pairs
-from extrags.restoration.benchmark.variants import AsRendered, WithoutReferences
+from extrags.restoration.benchmark.variants import AsRendered
 from extrags.restoration.clips import keep_known
-from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
-from extrags.restoration.diffusion.network import build_network
 from extrags.restoration.protocol import Clip, Restoration
 from extrags.restoration.uncertainty.reliability_diagram import calibration, rank_correlation
-from extrags.view_synthesis.conditioning import CONDITION_CHANNELS, LAYER_CHANNELS, Layers
-from extrags.view_synthesis.gamut import Gamut
+from extrags.view_synthesis.conditioning import LAYER_CHANNELS, Layers
 from extrags.view_synthesis.references import LightTransfer
 from tests.extrags.lit_tube import Tube, cast_tube, tube_cameras
 
@@ -435,78 +427,3 @@ class TestClips:
             held_out_clips(tube.scene, tube.references, tube.sequence, np.zeros(0, int), count=2)
         with pytest.raises(ConfigError, match="0 views"):
             held_out_clips(tube.scene, tube.references, tube.sequence, np.arange(2), count=2, length=0)
-
-
-class TestBench:
-    CONFIG = PipelineConfig(enhance=EnhanceConfig(references=4, seed=3))
-
-    def test_cases(self, tube: Tube) -> None:
-        methods = [
-            "none",
-            "classical",
-            "classical/no-references",
-            "classical/textured",
-            "classical/refined",
-            "classical/keyframes",
-        ]
-        cases = compare_methods(tube.scene, tube.sequence, self.CONFIG, methods, None)
-        assert [case["method"] for case in cases] == methods
-        for case in cases:
-            assert case["sequence"] == "test/tube"
-            assert case["seed"] == 3
-            assert case["steps"] is None
-            assert case["views"] == 2
-            assert case["seconds_per_frame"] > 0
-            measured = {figure.key for figure in figures("restoration")}
-            assert {"psnr", "ssim"} <= set(case["well"]) <= measured
-            assert not any(key.startswith("lpips") for key in case["well"]), "nobody asked for it"
-        # The gap in the wall is filled; exact references are worth something on top.
-        none, classical, alone, _, _, _ = (case["psnr"] for case in cases)
-        assert none + 10 < alone < classical - 0.5
-        assert [case["keyframes"] > 0 for case in cases] == [False] * 5 + [True]
-        # The tube's wall is plain: no texture to lay down, so that nothing gets worse by it.
-        assert cases[3]["psnr"] == pytest.approx(classical, abs=0.3)
-        json.dumps(cases, allow_nan=False)
-
-    def test_equal_recipes_are_followed_once(self, tube: Tube, monkeypatch: pytest.MonkeyPatch) -> None:
-        network = build_network(CONDITION_CHANNELS, (8, 8, 16), torch.Generator()).eval()
-        gamut = Gamut.of_images(torch.rand(1, 3, 32, 32), torch.ones(1, 1, 32, 32))
-        made = []
-
-        def recipe(*_given: object) -> EmbeddedEnhancer:
-            made.append(EmbeddedEnhancer(network, 2, 1, 0, False, gamut, {}))
-            return made[-1]
-
-        monkeypatch.setitem(bench.RECIPES, "embedded", recipe)
-        names = ["embedded", "embedded-1", "embedded-4/no-references"]
-        found = list(
-            prepared(names, tube.scene, tube.sequence, EnhanceConfig(), CoarseConfig())  # type: ignore[arg-type]
-        )
-        assert len(made) == 1
-        assert [name for name, _, _ in found] == names
-        first, one, four = (enhancer for _, enhancer, _ in found)
-        assert first is made[0]
-        assert isinstance(one, EmbeddedEnhancer)
-        assert one.steps == 1
-        assert isinstance(four, WithoutReferences)
-        assert isinstance(four.enhancer, EmbeddedEnhancer)
-        assert four.enhancer.steps == 4
-
-    def test_every_method_has_its_recipe(self) -> None:
-        assert {method.recipe for method in bench.METHODS.values()} <= set(bench.RECIPES)
-        assert not set(bench.METHODS) & set(BACKENDS)
-        assert check_methods(["none", "none", "scratch/no-references"]) == ["none", "scratch/no-references"]
-
-    @pytest.mark.parametrize("names", [["telea"], ["none", "embedded/without"], []])
-    def test_unknown_methods(self, names: list[str]) -> None:
-        with pytest.raises(ConfigError, match=r"expected none, embedded-1.* embedded, classical"):
-            check_methods(names)
-
-    def test_what_cannot_be_judged(self, tube: Tube) -> None:
-        unposed = replace(tube.sequence, world_from_camera=None)
-        with pytest.raises(CaptureError, match="no poses"):
-            bench_enhance([unposed], self.CONFIG)
-        with pytest.raises(CaptureError, match="no held-out frames"):
-            bench_enhance([tube.sequence.training_part()], self.CONFIG)
-        with pytest.raises(ConfigError, match="unknown methods"):
-            bench_enhance([], self.CONFIG, methods=["magic"])

@@ -93,7 +93,7 @@ class TestRefiner:
 
     def test_tiles_join_without_a_seam(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """A network that only darkens what is invented does so evenly, whatever the tiles."""
-        monkeypatch.setattr(refiner_module, "_with_coarse_colours", lambda refined, *_given: refined)
+        monkeypatch.setattr(refiner_module, "_with_coarse_colors", lambda refined, *_given: refined)
         rgb, laid, depth, unconfirmed = views()
         refiner = untrained()
         torch.nn.init.constant_(refiner.network.exit.bias, -0.3)

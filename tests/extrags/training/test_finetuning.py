@@ -275,7 +275,7 @@ class TestConfidences:
     def test_targets(self, pseudo: PseudoViews) -> None:
         for keep_known, images in ((True, pseudo.target), (False, pseudo.restored)):
             view = virtual_views(pseudo, config_of("paper", keep_known=keep_known))[1]
-            assert np.array_equal(view.colours.numpy(), images[2])
+            assert np.array_equal(view.colors.numpy(), images[2])
 
 
 class TestSteps:

@@ -101,7 +101,7 @@ class TestReconstruct:
     def test_a_diverging_loss_names_iteration_and_group(self, tube_sequence: EndoscopicSequence) -> None:
         result = reconstruct(tube_sequence, CoarseConfig(iterations=1, max_points=100))
         views = real_views(tube_sequence, tube_sequence.train)
-        poisoned = replace(views[0], rgb=torch.full_like(views[0].colours, float("nan")))
+        poisoned = replace(views[0], rgb=torch.full_like(views[0].colors, float("nan")))
 
         def draw(iteration: int) -> View:
             return poisoned if iteration == 3 else views[0]

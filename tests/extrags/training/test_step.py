@@ -247,7 +247,7 @@ class TestNativeStep:
 @pytest.mark.parametrize("make_step", [NativeStep, AutogradStep])
 def test_torch_threads_are_put_back(tube_sequence: EndoscopicSequence, make_step: MakeStep) -> None:
     view = real_views(tube_sequence, tube_sequence.train)[0]
-    poisoned = replace(view, rgb=torch.full_like(view.colours, np.nan))
+    poisoned = replace(view, rgb=torch.full_like(view.colors, np.nan))
     before = torch.get_num_threads()
     torch.set_num_threads(2)
     seen: list[int] = []

@@ -30,7 +30,7 @@ CONFIG = CoarseConfig()
 
 def in_floats(view: View) -> View:
     """The same view as it was held before images were compact: everything in float32."""
-    return replace(view, rgb=view.colours, weight=view.weights)
+    return replace(view, rgb=view.colors, weight=view.weights)
 
 
 def plain_view(sequence: EndoscopicSequence, frame: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -51,7 +51,7 @@ class TestRealViews:
         for view, frame in zip(real_views(changed, changed.train), changed.train, strict=True):
             rgb, weight, depth = plain_view(changed, int(frame))
             assert view.depth_mm is not None
-            assert np.array_equal(view.colours.numpy(), rgb)
+            assert np.array_equal(view.colors.numpy(), rgb)
             assert np.array_equal(view.weights.numpy(), weight)
             assert np.array_equal(view.depth_mm.numpy(), depth)
             assert 0 < weight.mean() < 1
@@ -133,7 +133,7 @@ class TestVirtualViews:
         below_one = replace(pseudo, pixel_confidence=pseudo.pixel_confidence.clip(0, 1)).quantised()
         for view, index in zip(virtual_views(below_one, config), (0, 2), strict=True):
             assert view.rgb.dtype == view.weight.dtype == torch.uint8
-            assert np.array_equal(view.colours.numpy(), below_one.target[index])
+            assert np.array_equal(view.colors.numpy(), below_one.target[index])
             expected = np.maximum(below_one.pixel_confidence[index], floor).astype(np.float32)
             assert np.array_equal(view.weights.numpy(), expected)
 
@@ -182,6 +182,6 @@ def test_views_decode_on_another_device(sequence: EndoscopicSequence) -> None:
     with second_device():
         moved = view.to(DEVICE)
         assert moved.rgb.dtype == torch.uint8
-        assert moved.colours.device == moved.weights.device == DEVICE
-        assert torch.equal(moved.colours.cpu(), view.colours)
+        assert moved.colors.device == moved.weights.device == DEVICE
+        assert torch.equal(moved.colors.cpu(), view.colors)
         assert torch.equal(moved.weights.cpu(), view.weights)

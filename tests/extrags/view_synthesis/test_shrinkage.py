@@ -13,7 +13,7 @@ from extrags.scene import Scene
 from extrags.view_synthesis.conditioning import observe_views
 from extrags.view_synthesis.gather import gather_references
 from extrags.view_synthesis.references import ReferenceViews
-from extrags.view_synthesis.shrinkage import NEIGHBOURS, PRIOR_PX, colour_support, shrunk_sh0
+from extrags.view_synthesis.shrinkage import NEIGHBOURS, PRIOR_PX, color_support, shrunk_sh0
 
 from ..lit_tube import Tube, build_tube
 
@@ -27,7 +27,7 @@ def sheet(n: int = 400) -> Scene:
     return Scene(Gaussians.from_points(points, np.full((n, 3), GREY), np.full(n, 0.7), opacity=0.5))
 
 
-def colours(sh0: Tensor) -> Tensor:
+def colors(sh0: Tensor) -> Tensor:
     return sh0[:, 0] * SH_C0 + 0.5
 
 
@@ -40,11 +40,11 @@ def with_red(scene: Scene, index: int) -> Scene:
 class TestShrunkColours:
     def test_a_colour_moves_by_what_its_neighbours_are_worth(self):
         scene = with_red(sheet(), 3)
-        own = colours(scene.gaussians.sh0)[3]
+        own = colors(scene.gaussians.sh0)[3]
         for pixels in (0.0, PRIOR_PX, 9 * PRIOR_PX):
             support = torch.full((400,), 50.0)
             support[3] = pixels
-            found = colours(shrunk_sh0(scene, support))[3]
+            found = colors(shrunk_sh0(scene, support))[3]
             share = PRIOR_PX / (pixels + PRIOR_PX)
             torch.testing.assert_close(found, own + share * (GREY - own), atol=1e-6, rtol=1e-5)
 
@@ -99,11 +99,11 @@ class TestShrunkColours:
             red = with_red(Scene(alone), index)
             support = torch.full((400,), 1e6)
             support[index] = 0
-            found = colours(shrunk_sh0(red, support))[index]
+            found = colors(shrunk_sh0(red, support))[index]
             torch.testing.assert_close(found, torch.full((3,), GREY), atol=1e-4, rtol=0)
             support[index] = 1e6
-            others = colours(shrunk_sh0(red, support))
-            torch.testing.assert_close(others[index], colours(red.gaussians.sh0)[index], atol=1e-4, rtol=0)
+            others = colors(shrunk_sh0(red, support))
+            torch.testing.assert_close(others[index], colors(red.gaussians.sh0)[index], atol=1e-4, rtol=0)
 
     def test_support_of_other_gaussians_is_refused(self):
         with pytest.raises(ShapeError, match="support of"):
@@ -115,11 +115,11 @@ class TestSupport:
         tube = build_tube()
         camera = tube.sequence.cameras[0]
         rendering = tube.scene.render(camera, visibility=True)
-        plain = colour_support(Scene(tube.scene.gaussians), camera, rendering)
+        plain = color_support(Scene(tube.scene.gaussians), camera, rendering)
         torch.testing.assert_close(plain.sum(), rendering.alpha.sum(), rtol=1e-4, atol=0)
         light = tube.scene.light
         assert light is not None
-        lit = colour_support(tube.scene, camera, rendering)
+        lit = color_support(tube.scene, camera, rendering)
         seen = plain > 0
         distance = np.linalg.norm(tube.scene.gaussians.means.numpy() - camera.centers[0], axis=1)
         near, far = (seen & torch.from_numpy(chosen) for chosen in (distance < 25, distance > 45))
@@ -157,7 +157,7 @@ class TestSupport:
         tube = build_tube()
         camera = tube.sequence.cameras[0]
         with pytest.raises(ShapeError, match="visibility=True"):
-            colour_support(tube.scene, camera, tube.scene.render(camera))
+            color_support(tube.scene, camera, tube.scene.render(camera))
 
 
 def gathered(tube: Tube, scene: Scene) -> ReferenceViews:
