@@ -230,8 +230,9 @@ def _check_own(dataset: Dataset, source: Source, config: IngestConfig) -> None:
     check_one_camera(config, source.name)
     if config.calibration is not None:
         raise ConfigError(
-            f"ingest.calibration is given, but {source.name} states its intrinsics itself; give one of the "
-            "two"
+            f"ingest.calibration is given, but {source.name} states its intrinsics itself: its frames are "
+            "rendered or published with them. The camera of scenes of your own in C3VD's layout stands in a "
+            "calibration.json beside the frames"
         )
 
 

@@ -136,6 +136,8 @@ class SourceFrames:
         intrinsics: whether the lenses are stated by the source, or guessed because nothing states them; then
             all frames have one.
         looked_at: steps of progress that were reported before the first frame is read.
+        lens_stays: why no calibration file may take the place of the lenses that are stated, as a sentence;
+            None where one may.
         stereo_camera: whose frames these are; None where nothing tells of two cameras.
     """
 
@@ -159,6 +161,7 @@ class SourceFrames:
     truth: Callable[[EndoscopicSequence], dict[str, Any]] | None = None
     intrinsics: Literal["given", "guessed"] = "given"
     looked_at: int = 0
+    lens_stays: str | None = None
     stereo_camera: StereoCamera | None = None
 
 

@@ -121,9 +121,9 @@ class IngestConfig(StageConfig):
     calibration: str | None = Field(
         None,
         min_length=1,
-        description="calibration file of the endoscope, for sources that state no intrinsics: OpenCV (YAML "
-        "or XML), Kalibr (camchain), Scaramuzza (calib_results.txt); its content counts in cache keys, not "
-        "its path",
+        description="calibration file of the endoscope: OpenCV (YAML or XML), Kalibr (camchain), Scaramuzza "
+        "(calib_results.txt). It takes the place of intrinsics that are guessed or stated beside frames, and "
+        "is refused where poses were solved with others; its content counts in cache keys, not its path",
     )
 
 
