@@ -261,7 +261,7 @@ def test_settings_exist(page: Path) -> None:
     named = [
         code.partition("=")[0].strip()
         for code in inline_code(page)
-        if re.match(rf"({stages})\.[\w.*]+( ?=.*)?$", code) and not code.endswith((".py", ".json"))
+        if re.match(rf"({stages})\.[\w.*]+( ?=.*)?$", code) and not code.endswith((".py", ".json", ".txt"))
     ]
     assert not [path for path in named if not setting_exists(path)]
 
