@@ -1,4 +1,4 @@
-"""Calibration files of endoscopes (OpenCV, Kalibr, Scaramuzza), for sources that state no intrinsics.
+"""Calibration files of endoscopes (OpenCV, Kalibr, Scaramuzza), which take the place of a source's own lens.
 
 * OpenCV: YAML, XML or JSON of `cv::FileStorage` with `camera_matrix` and `distortion_coefficients` (0, 4, 5,
   8 or more numbers; with 4 and `fisheye_model: 1`, or a `distortion_model` or `camera_model` that says so,
@@ -16,6 +16,7 @@ Scaramuzza et al., "A toolbox for easily calibrating omnidirectional cameras", I
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -29,17 +30,28 @@ from data_catalog.c3vd.scaramuzza import ScaramuzzaCamera, camera_from_json
 from data_catalog.file_storage import read_file_storage
 from data_catalog.lens_entries import lens_kind, tells_distortion
 from data_catalog.posed_frames import SourceFrames
-from data_catalog.sampling import LensSampling, Sampling
+from data_catalog.sampling import CameraModel, LensSampling, Sampling
 from extrags.config import IngestConfig
 from extrags.errors import ConfigError, SourceError, SourceNotFoundError
 from extrags.lens import Lens
 
-__all__ = ["CALIBRATION_VERSION", "read_calibration", "with_calibration_file"]
+__all__ = ["CALIBRATION_VERSION", "LENS_OF_POSES", "read_calibration", "with_calibration_file"]
+
+logger = logging.getLogger(__name__)
+
+LENS_OF_POSES = (
+    "Its poses were solved together with that lens, and with another one they would not fit the images: "
+    "solve them again with yours, or give the images alone a folder of their own, and poses are estimated "
+    "with it"
+)
+"""Why the lens of a source stays whose poses are of structure from motion."""
 
 CALIBRATION_VERSION = 4
 """Raised by hand whenever the same file gives another camera."""
 
 _PROPORTION_TOLERANCE = 0.005
+_COMPARED = 33
+"""Rows and columns of the grid over an image on which two lenses are compared."""
 _OPENCV_NAMES = {
     "K": ("camera_matrix", "Camera_Matrix", "cameraMatrix", "K"),
     "D": (
@@ -98,27 +110,60 @@ def read_calibration(file: Path, width: int, height: int) -> Lens | ScaramuzzaCa
 
 
 def with_calibration_file(source: SourceFrames, file: Path) -> SourceFrames:
-    """A source with the lens of a calibration file in place of its guess.
+    """A source with the lens of a calibration file in place of its guess, or of what it states.
+
+    By how much the two differ is said where the source states its own.
 
     Raises:
-        ConfigError: the source states its intrinsics itself.
+        ConfigError: the source's own lens has to stay, as the one its poses were solved with.
         SourceError: from `read_calibration`.
     """
-    if source.intrinsics != "guessed":
+    if source.lens_stays is not None:
         raise ConfigError(
             f"ingest.calibration is {file.name}, but the source {source.pose_file.name} states its "
-            "intrinsics itself; give one of the two"
+            f"intrinsics itself. {source.lens_stays}"
         )
     lenses = {
         lens: read_calibration(file, lens.width, lens.height)
         for lens in dict.fromkeys(frame.lens for frame in source.frames)
     }
+    if source.intrinsics != "guessed":
+        stated, calibrated = next(iter(lenses.items()))
+        logger.warning(
+            "%s: ingest.calibration, %s, takes the place of the intrinsics stated there: %s",
+            source.pose_file,
+            file.name,
+            _difference(stated, calibrated),
+            extra={"topic": "calibration", "field": "K"},
+        )
     return replace(
         source,
         frames=[replace(frame, lens=lenses[frame.lens]) for frame in source.frames],
         intrinsics="given",
         intrinsics_file=file,
         sampling=_sampling,
+    )
+
+
+def _difference(stated: CameraModel, calibrated: Lens | ScaramuzzaCamera) -> str:
+    """How far apart two lenses show the same directions, in words."""
+    focal_px = calibrated.K[0, 0] if isinstance(calibrated, Lens) else calibrated.a0
+    if not isinstance(stated, Lens):
+        return f"focal length {focal_px:.1f} px in the file"
+    focal = f"focal length {stated.K[0, 0]:.1f} px there and {focal_px:.1f} px in the file"
+    if not stated.is_pinhole:
+        return focal
+    side = np.linspace(0, 1, _COMPARED)
+    pixels = np.stack(np.meshgrid(side * stated.width, side * stated.height), axis=-1).reshape(-1, 2)
+    rays = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(stated.K).T
+    if isinstance(calibrated, Lens):
+        there = np.stack(calibrated.project(rays[:, 0], rays[:, 1]), axis=1)
+    else:
+        there = calibrated.project(rays) + 0.5
+    apart = np.linalg.norm(there - pixels, axis=1)
+    return (
+        f"{focal}; the same directions lie {float(np.median(apart)):.1f} px apart in the median over the "
+        f"image, at most {float(apart.max()):.1f} px"
     )
 
 

@@ -22,6 +22,7 @@ from data_catalog.folders import FolderDataset, find_reader
 from data_catalog.footage import DICOM_SUFFIXES, VIDEO_SUFFIXES
 from data_catalog.phantom.dataset import PHANTOM
 from data_catalog.specular import with_specular
+from data_catalog.stereo import check_one_camera
 from extrags.arguments import check_settings_argument
 from extrags.config import DEFAULT_PROFILE, PROFILES, IngestConfig
 from extrags.errors import ConfigError, SourceNotFoundError, UnknownSequenceError
@@ -118,7 +119,7 @@ def glance(name_or_path: str | Path, config: IngestConfig | None = None) -> Glan
     config = _settings(config, "glance")
     source = resolve(name_or_path)
     dataset = _dataset(source)
-    _check_calibration(dataset, source, config)
+    _check_own(dataset, source, config)
     _check_time_span(source, config)
     return dataset.glance(source, config) if isinstance(dataset, FolderDataset) else None
 
@@ -139,7 +140,7 @@ def read(source: Source | str | Path, config: IngestConfig | None = None) -> End
     """
     source = source if isinstance(source, Source) else resolve(source)
     dataset, config = _dataset(source), _settings(config, "read")
-    _check_calibration(dataset, source, config)
+    _check_own(dataset, source, config)
     _check_time_span(source, config)
     detail = source_detail(dataset, source, config)
     sequence = dataset.read(source, config if detail is None else detail.applied_to(config))
@@ -184,7 +185,8 @@ def source_fingerprint(source: Source | str | Path, config: IngestConfig | None 
         Plain JSON: for phantom and caverns their settings and generator version; for a folder the reader's
         name and version, name, size and BLAKE2b digest of each file the reader looks at, and what it chooses
         that is in no file; for two videos under a split manifest the files of both, and the manifest's line.
-        Where the settings name a calibration file, size and digest of it, and the version of what reads it.
+        Where the settings name a calibration file, size and digest of it, and the version of what reads it;
+        the camera of a stereo endoscope where it is not the left one.
 
     Raises:
         SourceError: the folder is not readable as a sequence.
@@ -194,6 +196,8 @@ def source_fingerprint(source: Source | str | Path, config: IngestConfig | None 
     config = _settings(config, "source_fingerprint")
     source = source if isinstance(source, Source) else resolve(source)
     found = _dataset(source).fingerprint(source, config)
+    if config.stereo_camera != "left":
+        found = {**found, "stereo_camera": config.stereo_camera}
     if config.calibration is None:
         return found
     file = Path(config.calibration).expanduser()
@@ -219,12 +223,16 @@ def _settings(config: IngestConfig | None, function: str) -> IngestConfig:
     return config
 
 
-def _check_calibration(dataset: Dataset, source: Source, config: IngestConfig) -> None:
-    """Refuse a calibration file for a sequence of the catalogue's own."""
-    if config.calibration is not None and not isinstance(dataset, FolderDataset):
+def _check_own(dataset: Dataset, source: Source, config: IngestConfig) -> None:
+    """Refuse what a sequence of the catalogue's own does not have: another calibration, a second camera."""
+    if isinstance(dataset, FolderDataset):
+        return
+    check_one_camera(config, source.name)
+    if config.calibration is not None:
         raise ConfigError(
-            f"ingest.calibration is given, but {source.name} states its intrinsics itself; give one of the "
-            "two"
+            f"ingest.calibration is given, but {source.name} states its intrinsics itself: its frames are "
+            "rendered or published with them. The camera of scenes of your own in C3VD's layout stands in a "
+            "calibration.json beside the frames"
         )
 
 

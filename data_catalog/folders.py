@@ -29,6 +29,7 @@ from data_catalog.readers import (
     simcol,
     sinus,
     transforms_json,
+    tum,
     video,
 )
 from extrags.config import IngestConfig
@@ -44,6 +45,7 @@ READERS: tuple[FolderReader, ...] = (
     c3vd.READER,
     transforms_json.READER,
     endonerf.READER,
+    tum.READER,
     colmap_model.READER,
     video.READER,
     dicom.READER,
@@ -180,8 +182,8 @@ def _recognised(path: Path) -> FolderReader:
     raise SourceNotFoundError(
         f"no sequence recognised in this folder{_what_is_there(path)}; expected images ({kinds}) in it, "
         "in images/ or in rgb/, a video, a DICOM file, a COLMAP model, "
-        f"transforms.json, poses.json, C3VD, SimCol3D, EndoNeRF or the sinus set{more} (the layout of each: "
-        "docs/sources.md)",
+        f"transforms.json, poses.json, C3VD, SimCol3D, EndoNeRF, TUM or the sinus set{more} (the layout of "
+        "each: docs/sources.md)",
         file=path,
     )
 

@@ -134,6 +134,8 @@ def facts(sequence: EndoscopicSequence) -> dict[str, Any]:
         "specular_share": float(specular.sum() / inside),
         "saturated_share": saturated / inside,
     }
+    if sequence.stereo_camera is not None:
+        result["stereo_camera"] = sequence.stereo_camera
     if sequence.world_from_camera is not None:
         centers = sequence.cameras.centers
         result["path_length"] = float(np.linalg.norm(np.diff(centers, axis=0), axis=1).sum())

@@ -32,6 +32,7 @@ from data_catalog.images import (
 from data_catalog.lens_use import LensUse
 from data_catalog.sampling import CameraModel, LensSampling, Sampling
 from data_catalog.splits import every_nth
+from data_catalog.stereo import check_one_camera
 from data_catalog.unknown_depth import UnknownDepth
 from extrags.cameras import Cameras, rotation_about
 from extrags.config import IngestConfig
@@ -40,11 +41,11 @@ from extrags.events import Progress, emit
 from extrags.frame_stacks import FrameStack, stacked
 from extrags.lens import Lens
 from extrags.observed_surface import observed_by_depth
+from extrags.provenance import StereoCamera
 from extrags.radial_lens import RadialLens
 from extrags.sequence import EndoscopicSequence, Split
 
 __all__ = ["MaskFinder", "PosedFrame", "SourceFrames", "assembled", "chosen_frames", "planned_sampling"]
-
 
 logger = logging.getLogger(__name__)
 
@@ -135,6 +136,9 @@ class SourceFrames:
         intrinsics: whether the lenses are stated by the source, or guessed because nothing states them; then
             all frames have one.
         looked_at: steps of progress that were reported before the first frame is read.
+        lens_stays: why no calibration file may take the place of the lenses that are stated, as a sentence;
+            None where one may.
+        stereo_camera: whose frames these are; None where nothing tells of two cameras.
     """
 
     frames: Sequence[PosedFrame]
@@ -157,6 +161,8 @@ class SourceFrames:
     truth: Callable[[EndoscopicSequence], dict[str, Any]] | None = None
     intrinsics: Literal["given", "guessed"] = "given"
     looked_at: int = 0
+    lens_stays: str | None = None
+    stereo_camera: StereoCamera | None = None
 
 
 def assembled(source: SourceFrames, config: IngestConfig, name: str) -> EndoscopicSequence:
@@ -213,6 +219,7 @@ def assembled(source: SourceFrames, config: IngestConfig, name: str) -> Endoscop
         points_rgb=source.points_rgb,
         intrinsics=source.intrinsics,
         lens=lens,
+        stereo_camera=source.stereo_camera,
     )
     return sequence if source.truth is None else replace(sequence, truth=source.truth(sequence))
 
@@ -229,7 +236,10 @@ def chosen_frames(
     Raises:
         SourceError: no frame or a single one, or depth, poses or a split for some frames alone.
         PoseError: a pose that is no rigid motion.
+        ConfigError: the right camera is asked for, and nothing tells of two.
     """
+    if source.stereo_camera is None:
+        check_one_camera(config, str(source.pose_file))
     if not source.frames:
         raise SourceError("there is no frame", file=source.pose_file, field="frames")
     _check_for_all_or_none(source, "depth", [frame.depth_file for frame in source.frames])

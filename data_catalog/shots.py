@@ -13,7 +13,7 @@ from jaxtyping import UInt8
 
 from extrags.dense_flow import DenseFlow
 
-__all__ = ["ShotFinder", "followed_share"]
+__all__ = ["ShotFinder", "followed_share", "show_the_same"]
 
 _SURELY_ALIKE = 0.9
 """Neighbours that correlate so well, unmoved, need no flow to tell that they belong together; across cuts
@@ -55,10 +55,10 @@ class ShotFinder:
             return False
         if self._anchor is not None and index - self._cut_at > _LONGEST_GLITCH:
             self._anchor = None
-        if self._belongs(before, grey):
+        if show_the_same(before, grey, self._flow):
             self.shots.append(self.shots[-1])
             return True
-        if self._anchor is not None and self._belongs(self._anchor, grey):
+        if self._anchor is not None and show_the_same(self._anchor, grey, self._flow):
             # Back in the shot that was left: what lay between was no shot.
             shot = self.shots[self._cut_at - 1]
             self.shots[self._cut_at :] = [shot] * (index - self._cut_at)
@@ -71,13 +71,21 @@ class ShotFinder:
         self.shots.append(self.shots[-1] + 1)
         return False
 
-    def _belongs(self, before: UInt8[np.ndarray, "h w"], after: UInt8[np.ndarray, "h w"]) -> bool:
-        if _correlation(before, after) > _SURELY_ALIKE:
-            return True
-        if followed_share(before, after, self._flow) >= _FOLLOWED:
-            return True
-        # The flow loses a move of an eighth of the width or more; a swing as a whole is found first.
-        return followed_share(_swung(before, after), after, self._flow) >= _FOLLOWED
+
+def show_the_same(before: UInt8[np.ndarray, "h w"], after: UInt8[np.ndarray, "h w"], flow: DenseFlow) -> bool:
+    """Whether two pictures show the same place, from where the camera may have moved.
+
+    Args:
+        before: small and grey, about 200 pixels wide.
+        after: the same size.
+        flow: kept between calls.
+    """
+    if _correlation(before, after) > _SURELY_ALIKE:
+        return True
+    if followed_share(before, after, flow) >= _FOLLOWED:
+        return True
+    # The flow loses a move of an eighth of the width or more; a swing as a whole is found first.
+    return followed_share(_swung(before, after), after, flow) >= _FOLLOWED
 
 
 def followed_share(

@@ -4,7 +4,14 @@ from __future__ import annotations
 
 from typing import Literal
 
-__all__ = ["ARBITRARY_SCALE", "SCALE_WORDS", "IntrinsicsSource", "PoseSource", "ScaleSource"]
+__all__ = [
+    "ARBITRARY_SCALE",
+    "SCALE_WORDS",
+    "IntrinsicsSource",
+    "PoseSource",
+    "ScaleSource",
+    "StereoCamera",
+]
 
 PoseSource = Literal["given", "estimated", "aligned", "refined"]
 """Origin of the poses. given: by the source; estimated: by COLMAP; aligned: by RGB-D alignment; refined:
@@ -17,6 +24,9 @@ because nothing states them; estimated: by bundle adjustment, with the poses."""
 ScaleSource = Literal["source", "setting", "depth", "working_distance"]
 """What the unit of length rests on. source: what the source says of it; setting: `ingest.scale_mm_per_unit`;
 depth: known depth that estimated poses were scaled by; working_distance: `poses.working_distance_mm`."""
+
+StereoCamera = Literal["left", "right"]
+"""Whose frames these are, of a source with those of both cameras of a stereo endoscope."""
 
 SCALE_WORDS: dict[ScaleSource, str] = {
     "source": "millimetres as the source has them",

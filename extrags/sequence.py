@@ -15,7 +15,14 @@ from extrags.cameras import Cameras
 from extrags.errors import ShapeError
 from extrags.frame_stacks import frames_of, stacked
 from extrags.lens import Undistortion, resized_depth
-from extrags.provenance import ARBITRARY_SCALE, SCALE_WORDS, IntrinsicsSource, PoseSource, ScaleSource
+from extrags.provenance import (
+    ARBITRARY_SCALE,
+    SCALE_WORDS,
+    IntrinsicsSource,
+    PoseSource,
+    ScaleSource,
+    StereoCamera,
+)
 from extrags.radial_lens import VIRTUAL_FIELD_DEG, RadialLens
 from extrags.splits import Split
 from extrags.store.storable import Storable
@@ -28,6 +35,7 @@ __all__ = [
     "PoseSource",
     "ScaleSource",
     "Split",
+    "StereoCamera",
     "saturated_mask",
 ]
 
@@ -35,6 +43,8 @@ _SQUARE = 0.01
 """Focal lengths across and down that differ by a smaller share are those of square pixels."""
 ALL_OF_AREA = 0.999
 """A downscaled pixel is valid above this share of valid area; below one because of rounding."""
+_STACKS = ("depth_mm", "withheld_depth_mm", "depth_error", "observed", "specular")
+_ARRAYS = ("world_from_camera", "recording", "points", "points_rgb")
 
 
 @dataclass(frozen=True)
@@ -70,6 +80,7 @@ class EndoscopicSequence(Storable):
         depth_error: expected relative error of an estimated `depth_mm`, [F, H, W]; None where the depth was
             measured.
         lens: of all frames, where they are the original pixels of a wide lens; None for pinholes.
+        stereo_camera: whose frames these are, of a stereo endoscope; None of a source with one camera.
 
     Raises:
         ShapeError: when sizes or types do not fit, or the split names frames that are not there.
@@ -101,6 +112,7 @@ class EndoscopicSequence(Storable):
     scale_source: ScaleSource = "source"
     depth_error: Float[np.ndarray, "f h w"] | None = None
     lens: RadialLens | None = None
+    stereo_camera: StereoCamera | None = None
 
     def __post_init__(self) -> None:
         check_array(self.rgb, f"{self.name}: rgb", (None, None, None, 3), np.uint8)
@@ -416,11 +428,11 @@ class EndoscopicSequence(Storable):
             write_array(group, "K", self.K)
             write_array(group, "split/train", self.split.train.astype(np.int64))
             write_array(group, "split/test", self.split.test.astype(np.int64))
-            for name in ("depth_mm", "withheld_depth_mm", "depth_error", "observed", "specular"):
+            for name in _STACKS:
                 stack = getattr(self, name)
                 if stack is not None:
                     write_frames(group, name, stack)
-            for name in ("world_from_camera", "recording", "points", "points_rgb"):
+            for name in _ARRAYS:
                 array = getattr(self, name)
                 if array is not None:
                     write_array(group, name, array)
@@ -434,16 +446,15 @@ class EndoscopicSequence(Storable):
                 }
             )
             # Written only where it differs from the default, so that older artefacts keep their digest.
-            if self.pose_source != "given":
-                group.attrs["pose_source"] = self.pose_source
-            if self.intrinsics != "given":
-                group.attrs["intrinsics"] = self.intrinsics
-            if self.focal_std_px is not None:
-                group.attrs["focal_std_px"] = self.focal_std_px
-            if self.lens is not None:
-                group.attrs["lens"] = self.lens.to_json()
-            if self.scale_source != "source":
-                group.attrs["scale_source"] = self.scale_source
+            facts = (
+                ("pose_source", self.pose_source, "given"),
+                ("intrinsics", self.intrinsics, "given"),
+                ("focal_std_px", self.focal_std_px, None),
+                ("lens", None if self.lens is None else self.lens.to_json(), None),
+                ("scale_source", self.scale_source, "source"),
+                ("stereo_camera", self.stereo_camera, None),
+            )
+            group.attrs.update({name: fact for name, fact, usual in facts if fact != usual})
 
     @classmethod
     def load(cls, path: Path) -> EndoscopicSequence:
@@ -452,18 +463,7 @@ class EndoscopicSequence(Storable):
         attributes = dict(group.attrs)
         split: Any = attributes["split"]
         optional = {
-            name: read_array(group, name) if has_array(group, name) else None
-            for name in (
-                "depth_mm",
-                "withheld_depth_mm",
-                "depth_error",
-                "observed",
-                "specular",
-                "world_from_camera",
-                "recording",
-                "points",
-                "points_rgb",
-            )
+            name: read_array(group, name) if has_array(group, name) else None for name in (*_STACKS, *_ARRAYS)
         }
         truth: Any = attributes["truth"]
         lens: Any = attributes.get("lens")
@@ -487,6 +487,7 @@ class EndoscopicSequence(Storable):
             focal_std_px=cast("float | None", attributes.get("focal_std_px")),
             scale_source=cast("ScaleSource", attributes.get("scale_source", "source")),
             lens=None if lens is None else RadialLens.from_json(lens),
+            stereo_camera=cast("StereoCamera | None", attributes.get("stereo_camera")),
             **optional,
         )
 

@@ -71,6 +71,7 @@ def ingest(
         detail_width=detail.reduced_width,
         detail_height=detail.reduced_height,
         detail=str(detail),
+        stereo_camera=sequence.stereo_camera or "",
         masked_share=float(1 - sequence.mask.mean()),
         specular_share=0.0 if sequence.specular is None else float(sequence.specular.sum() / inside),
         saturated_share=saturated / inside,

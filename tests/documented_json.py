@@ -44,6 +44,18 @@ def undocumented(value: Any, section: str) -> list[str]:
     return _of_object(value, section, "$")
 
 
+def undocumented_items(items: Any, section: str) -> list[str]:
+    """The same of a list of JSON objects, of which there has to be one at least.
+
+    Args:
+        items: of a command.
+        section: anchor of what one of them is.
+    """
+    if not isinstance(items, list) or not items:
+        return ["$ is no list with items"]
+    return [line for index, item in enumerate(items) for line in _of_object(item, section, f"$.{index}")]
+
+
 def _of_object(value: Any, section: str, where: str) -> list[str]:
     if not isinstance(value, dict):
         return [f"{where} is {type(value).__name__}, not an object"]

@@ -32,6 +32,7 @@ from tests.data_catalog.footage_fixture import write_dicom, write_video
 from tests.data_catalog.layouts import write_endonerf
 from tests.data_catalog.test_calibration_files import OCAMCALIB, kalibr_file, opencv_file
 from tests.data_catalog.test_content import moving_scene
+from tests.data_catalog.tum_fixture import write_tum
 from tests.fuzzing import Case
 
 CONFIG = IngestConfig(max_frames=3)
@@ -117,6 +118,12 @@ def colmap(*, binary: bool) -> Callable[[Path], Path]:
 def endonerf(folder: Path) -> Path:
     """LLFF poses."""
     write_endonerf(sequence(), folder)
+    return folder
+
+
+def tum(folder: Path) -> Path:
+    """Lists and a trajectory by time."""
+    write_tum(sequence(), folder)
     return folder
 
 
@@ -294,6 +301,8 @@ CASES: dict[str, Case] = {
     "depth.bin": Case(colmap(binary=True), "stereo/depth_maps/1.png.geometric.bin", source),
     "split.txt": Case(colmap(binary=True), "test_list.txt", source),
     "poses_bounds.npy": Case(endonerf, "poses_bounds.npy", source),
+    "tum-rgb.txt": Case(tum, "rgb.txt", source),
+    "groundtruth.txt": Case(tum, "groundtruth.txt", source),
     "frames.jpg": Case(frames, "1.jpg", source),
     "intrinsics.json": Case(frames, "intrinsics.json", source),
     "video.mp4": Case(video("a.mp4", "mp4v"), "a.mp4", source),

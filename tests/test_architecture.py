@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 import tomllib
 from pathlib import Path
+
+import yaml
 
 import extrags
 
@@ -50,6 +53,29 @@ def test_the_version_is_the_project_s() -> None:
     assert extrags.__version__ == PROJECT["project"]["version"]
 
 
+def test_the_citation_is_of_this_version() -> None:
+    citation = yaml.safe_load((REPOSITORY / "CITATION.cff").read_text())
+    assert {"cff-version", "message", "title", "authors", "type"} <= set(citation)
+    assert citation["cff-version"] == "1.2.0"
+    for key, name in (("version", "version"), ("title", "name"), ("license", "license")):
+        assert citation[key] == PROJECT["project"][name]
+    assert citation["keywords"] == PROJECT["project"]["keywords"]
+    assert citation["authors"] == [{"name": "extrags developers"}]
+    (paper,) = citation["references"]
+    names = ", ".join(f"{author['given-names']} {author['family-names']}" for author in paper["authors"])
+    cited = (REPOSITORY / "docs" / "references.md").read_text()
+    number = paper["identifiers"][0]["value"]
+    assert f"{names}: *{paper['title']}*. {paper['conference']['name']}, {number}." in cited
+
+
+def test_the_changelog_is_of_this_version() -> None:
+    changelog = (REPOSITORY / "CHANGELOG.md").read_text()
+    assert re.findall(r"^## (\S+?),? ", changelog, re.MULTILINE)[0] == PROJECT["project"]["version"]
+    assert len(changelog.splitlines()) <= 120
+    for link in re.findall(r"\]\(([^)#]+)", changelog):
+        assert link.startswith("https://") or (REPOSITORY / link).is_file(), link
+
+
 def test_root_holds_only_what_belongs_there() -> None:
     tracked = subprocess.run(
         ["git", "ls-files"], cwd=REPOSITORY, capture_output=True, text=True, check=True
@@ -57,6 +83,7 @@ def test_root_holds_only_what_belongs_there() -> None:
     roots = {name.split("/")[0] for name in tracked if name and not name.startswith(".")}
     assert roots <= {
         "extrags", "tasks", "flows", "data_catalog", "tests", "docs", "examples",
+        "CHANGELOG.md", "CITATION.cff",
         "pyproject.toml", "README.md", "LICENSE", "Makefile", "CMakeLists.txt", "prefect.yaml",
         "requirements.lock", "deploy",
     }  # fmt: skip

@@ -17,7 +17,7 @@ from pydantic import BaseModel
 
 from data_catalog.catalog import describe
 from extrags.config import PipelineConfig
-from tests.documented_json import tables, undocumented
+from tests.documented_json import tables, undocumented, undocumented_items
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 PROTOCOL = REPOSITORY / "extrags" / "metrics" / "PROTOCOL.md"
@@ -106,6 +106,8 @@ def test_json_that_is_not_as_documented_is_found() -> None:
     assert undocumented(shares, "shares") == []
     assert undocumented({**shares, "seen": 1.0}, "shares") == ["$.seen is not documented"]
     assert undocumented({**shares, "held_out": "0"}, "shares") == ["$.held_out is str, not number or null"]
+    assert undocumented_items([shares, {**shares, "seen": 1.0}], "shares") == ["$.1.seen is not documented"]
+    assert undocumented_items([], "shares") == ["$ is no list with items"]
     del shares["badly_seen"]
     assert undocumented(shares, "shares") == ["$.badly_seen is not there"]
     costs = {"stage": "coarse", "processor_seconds": 1.0, "seconds": None}
@@ -261,7 +263,7 @@ def test_settings_exist(page: Path) -> None:
     named = [
         code.partition("=")[0].strip()
         for code in inline_code(page)
-        if re.match(rf"({stages})\.[\w.*]+( ?=.*)?$", code) and not code.endswith((".py", ".json"))
+        if re.match(rf"({stages})\.[\w.*]+( ?=.*)?$", code) and not code.endswith((".py", ".json", ".txt"))
     ]
     assert not [path for path in named if not setting_exists(path)]
 

@@ -242,6 +242,7 @@ def _source_frames(parts: list[_Part], mesh: CoverageMesh | None, truth: dict[st
         masks=_DarkFrameMask(),
         sampling=_sampling,
         observed=observed_by_depth if mesh is None else partial(_observed_on, Surface(mesh)),
+        lens_stays="State the camera of scenes of your own in a calibration.json beside the frames",
         truth=lambda sequence: {"c3vd": {**truth, "recordings": _reports(parts, sequence)}},
     )
 

@@ -17,6 +17,7 @@ from extrags.errors import SourceError
 __all__ = [
     "check_one_format",
     "frames_among",
+    "is_of_another_kind",
     "listed_files",
     "tell_about_folders",
     "tell_about_pictures",
@@ -80,6 +81,12 @@ def frames_among(files: Sequence[Path]) -> tuple[list[Path], list[Path]]:
         if matched and matched >= _MATCHED_SHARE * len(members):
             left_out.update(members)
     return [file for file in files if file not in left_out], [file for file in files if file in left_out]
+
+
+def is_of_another_kind(name: str) -> bool:
+    """Whether a name says that what it stands for is depth, a mask or the like."""
+    words = _parts(name)[1][0]
+    return _has(words, _KIND) or _has(words, _PERHAPS_KIND)
 
 
 def _parts(stem: str) -> tuple[tuple[str, ...], tuple[frozenset[str], tuple[int, ...]]]:

@@ -32,6 +32,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from data_catalog.calibration_files import LENS_OF_POSES
 from data_catalog.folder_reader import FolderReader
 from data_catalog.images import COLOR_SUFFIXES, file_key, natural_key, order_for_fingerprint, save_images
 from data_catalog.inside import inside
@@ -220,6 +221,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
         pose_file=pose_file,
         metric=_is_metric(folder),
         intrinsics_file=pose_file,
+        lens_stays=LENS_OF_POSES,
         read_depth=lambda file, frame: read_depth_map(file, frame=frame),
         points=model.points if len(model.points) else None,
         points_rgb=model.points_rgb if len(model.points) else None,

@@ -36,7 +36,7 @@ from data_catalog.folder_reader import FolderReader
 from data_catalog.footage import DICOM_SUFFIXES, Footage, FootageFrame, TimeSpan
 from data_catalog.posed_frames import SourceFrames
 from data_catalog.readers.footage_frames import footage_frames, footage_outline
-from data_catalog.readers.video import VideoFile, only_file, tell_about_stills, with_files_beside
+from data_catalog.readers.video import VideoFile, files_meant, footage_meant, with_files_beside
 from extrags.config import IngestConfig
 from extrags.errors import (
     ExtragsError,
@@ -229,44 +229,39 @@ def open_dicom(file: Path) -> Footage:
         return DicomFile(file, header)
 
 
-def _dicom_file(place: Path) -> Path | None:
-    found = only_file(place, DICOM_SUFFIXES)
-    if found is None and place.is_file() and not place.suffix:
+def _dicom_files(place: Path) -> tuple[Path, ...]:
+    found = files_meant(place, DICOM_SUFFIXES)
+    if not found and place.is_file() and not place.suffix:
         # As scanners and archives export them: no suffix, but a signature.
         with place.open("rb") as stream:
             stream.seek(_MAGIC_AT)
-            return place if stream.read(len(_MAGIC)) == _MAGIC else None
+            return (place,) if stream.read(len(_MAGIC)) == _MAGIC else ()
     return found
 
 
 def _recognises(place: Path) -> bool:
-    return _dicom_file(place) is not None
+    return bool(_dicom_files(place))
 
 
 def _files(place: Path) -> list[Path]:
-    file = _dicom_file(place)
-    return [] if file is None else with_files_beside(file)
+    return with_files_beside(_dicom_files(place))
 
 
 def _frames(place: Path, config: IngestConfig) -> SourceFrames:
-    return footage_frames(_footage(place), config)
+    return footage_frames(_footage(place, config), config)
 
 
 def _outline(place: Path, config: IngestConfig) -> SourceFrames:
-    return footage_outline(_footage(place), config)
+    return footage_outline(_footage(place, config), config)
 
 
-def _footage(place: Path) -> Footage:
-    file = _dicom_file(place)
-    if file is None:
-        raise SourceNotFoundError("no DICOM file here", file=place)
-    tell_about_stills(place, file)
-    return open_dicom(file)
+def _footage(place: Path, config: IngestConfig) -> Footage:
+    return footage_meant(place, _dicom_files(place), open_dicom, config)
 
 
 READER = FolderReader(
     name="dicom",
-    version=5,
+    version=6,
     summary="a DICOM multi-frame file (dcm), optionally with intrinsics.json and mask.png beside it",
     recognises=_recognises,
     files=_files,

@@ -36,6 +36,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from data_catalog.calibration_files import LENS_OF_POSES
 from data_catalog.folder_reader import FolderReader
 from data_catalog.images import color_files, order_for_fingerprint, read_color, read_mask, spread
 from data_catalog.posed_frames import PosedFrame, SourceFrames
@@ -148,7 +149,12 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
             )
         )
     return SourceFrames(
-        frames, pose_file=file, metric=True, intrinsics_file=file, white_is_tissue=white_is_tissue
+        frames,
+        pose_file=file,
+        metric=True,
+        intrinsics_file=file,
+        white_is_tissue=white_is_tissue,
+        lens_stays=LENS_OF_POSES,
     )
 
 

@@ -22,10 +22,11 @@ from data_catalog.images import spread
 from data_catalog.interlacing import deinterlaced
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from data_catalog.readers.frames_folder import mask_beside, read_intrinsics, stated_intrinsics
+from data_catalog.readers.stereo_footage import OneCamera, of_one_camera, time_span
 from data_catalog.sampling import Sampling
 from data_catalog.survey import NOTHING_DECODED, Shot, Survey, choose_frames, survey
 from extrags.config import IngestConfig
-from extrags.errors import ConfigError, SourceError
+from extrags.errors import SourceError
 from extrags.lens import Lens
 
 __all__ = ["MAX_FRAMES", "footage_frames", "footage_outline"]
@@ -55,7 +56,8 @@ def footage_frames(footage: Footage, config: IngestConfig) -> SourceFrames:
         ConfigError: a part that ends before it begins.
         SourceError: damaged, empty in that part, or a picture that hardly moves.
     """
-    file, span = footage.file, _span(config)
+    footage = of_one_camera(footage, config)
+    file, span = footage.file, time_span(config)
     found = survey(_frames_of(footage, span), file=file, announced=footage.announced)
     shot = found.longest_shot()
     _report(found, shot, footage)
@@ -85,18 +87,13 @@ def footage_outline(footage: Footage, config: IngestConfig) -> SourceFrames:
         ConfigError: a part that ends before it begins.
         SourceError: no frame can be decoded, or intrinsics beside the file are damaged.
     """
-    _span(config)
+    time_span(config)
     if not all(footage.size):
         raise SourceError(NOTHING_DECODED, file=footage.file)
+    footage = of_one_camera(footage, config)
     most = config.max_frames or MAX_FRAMES
     there = footage.announced or most
     return _unread(footage, config, np.array(spread(there, most)), *footage.size)
-
-
-def _span(config: IngestConfig) -> TimeSpan:
-    if config.end_s is not None and config.end_s <= config.start_s:
-        raise ConfigError(f"ingest.end_s = {config.end_s:g} is not after ingest.start_s = {config.start_s:g}")
-    return TimeSpan(config.start_s, np.inf if config.end_s is None else config.end_s)
 
 
 def _unread(
@@ -120,6 +117,7 @@ def _unread(
         pose_file=file,
         metric=False,
         intrinsics=stated_intrinsics(file.parent, config),
+        stereo_camera=config.stereo_camera if isinstance(footage, OneCamera) else None,
     )
 
 

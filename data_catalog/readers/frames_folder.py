@@ -3,8 +3,9 @@
 Images lie in the folder itself, or in `images/` or `rgb/` below it, and are taken in natural order (9 before
 10). Where several of these hold images, those of the one with at least twice as many as any other are taken,
 and the others named in a warning; without such a one the source is refused. Woven (interlaced) images are
-read as they are, with a warning. What is depth or a mask of a frame by its name is left out, and what tells
-of poses is not read, both with a warning (`data_catalog.readers.beside_frames`).
+read as they are, with a warning. Of a stereo endoscope the frames of one camera are read
+(`data_catalog.readers.stereo_frames`). What is depth or a mask of a frame by its name is left out, and what
+tells of poses is not read, both with a warning (`data_catalog.readers.beside_frames`).
 
 Optional beside them: `intrinsics.json` with `K` (3 x 3), or `fx`, `fy`, `cx`, `cy`, or `field_of_view_deg`
 (horizontal), in pixels of the files with centres at +0.5, of a pinhole; and `mask.png` (white is tissue).
@@ -48,10 +49,19 @@ from data_catalog.readers.beside_frames import (
     tell_about_pictures,
     tell_what_is_not_read,
 )
+from data_catalog.readers.stereo_frames import (
+    FramesOfCamera,
+    StereoFolders,
+    frames_of_camera,
+    stereo_folders,
+    views_in_pictures,
+)
 from data_catalog.sampling import Sampling
+from data_catalog.stereo import BothViews
 from extrags.config import IngestConfig
 from extrags.errors import SourceError, SourceNotFoundError
 from extrags.lens import Lens
+from extrags.provenance import StereoCamera
 
 __all__ = [
     "FEWEST_FRAMES",
@@ -104,44 +114,69 @@ def places_with_frames(folder: Path) -> dict[Path, list[Path]]:
 
     Links to nothing are among them: which place is meant does not depend on whether its files are there.
     """
-    places = [place for place in (folder, folder / "images", folder / "rgb") if place.is_dir()]
-    found = {place: frames_among(_pictures(place))[0] for place in places}
+    found = {place: frames_among(_pictures(place))[0] for place in _places(folder)}
     return {place: found[place] for place in sorted(found, key=lambda at: -len(found[at])) if found[place]}
+
+
+def _places(folder: Path) -> list[Path]:
+    return [place for place in (folder, folder / "images", folder / "rgb") if place.is_dir()]
 
 
 def _pictures(place: Path) -> list[Path]:
     return [file for file in image_entries(place) if not is_mask(file)]
 
 
-def _images(folder: Path) -> list[Path]:
-    """The frames to read; none where there are none.
+def _images(folder: Path, camera: StereoCamera = "left") -> FramesOfCamera | None:
+    """The frames to read; None where there are none.
 
     Raises:
-        SourceError: several places hold about as many, or one frame is there in two formats.
+        SourceError: several places hold about as many, one frame is there in two formats, or nothing tells
+            which frames belong to which camera.
         SourceNotFoundError: one of the frames is a link to a file that is not there.
     """
-    found = places_with_frames(folder)
+    found = _all_places(folder)
     if not found:
-        return []
-    files, *others = found.values()
-    if others and len(files) < _CLEARLY_MORE * len(others[0]):
+        return None
+    place, *others = found
+    most, *fewer = (_of_one_camera(at, there) for at, there in found.items())
+    if others and most < _CLEARLY_MORE * fewer[0]:
         told = " and ".join(f"{len(there)} images {_said(at, folder)}" for at, there in found.items())
         raise SourceError(
             f"{told}; give the path of the folder to read, or move away what is not to be read", file=folder
         )
-    check_links(files)
-    check_one_format(files)
-    return files
+    read = frames_of_camera(place, found[place], camera)
+    check_links(read.all_files)
+    check_one_format(read.files)
+    return read
 
 
-def _said(place: Path, folder: Path) -> str:
+def _all_places(folder: Path) -> dict[Path | StereoFolders, list[Path]]:
+    """As `places_with_frames`, and folders of a left and a right camera with the frames of both."""
+    found: dict[Path | StereoFolders, list[Path]] = {}
+    found.update(places_with_frames(folder).items())
+    for place in _places(folder):
+        for pair in stereo_folders(place):
+            found[pair] = [file for at in (pair.left, pair.right) for file in frames_among(_pictures(at))[0]]
+    return {at: found[at] for at in sorted(found, key=lambda place: -_of_one_camera(place, found[place]))}
+
+
+def _of_one_camera(place: Path | StereoFolders, files: list[Path]) -> int:
+    """Number of frames of the camera of which there are more."""
+    if isinstance(place, Path):
+        return len(files)
+    return max(sum(file.parent == at for file in files) for at in (place.left, place.right))
+
+
+def _said(place: Path | StereoFolders, folder: Path) -> str:
+    if isinstance(place, StereoFolders):
+        return f"in {place}"
     return "in the folder itself" if place == folder else f"in {place.name}/"
 
 
 def _recognises(folder: Path) -> bool:
     if not folder.is_dir():
         return False
-    most = max((len(files) for files in places_with_frames(folder).values()), default=0)
+    most = max((len(files) for files in _all_places(folder).values()), default=0)
     # A few pictures beside several videos are not what is meant.
     return most >= FEWEST_FRAMES or (most > 0 and not _footage(folder))
 
@@ -150,17 +185,18 @@ def _footage(folder: Path) -> list[Path]:
     return files_of_kind(folder, (*VIDEO_SUFFIXES, *DICOM_SUFFIXES))
 
 
-def _tell_what_is_passed_over(folder: Path, files: list[Path]) -> None:
+def _tell_what_is_passed_over(folder: Path, read: FramesOfCamera) -> None:
     """Warn of images elsewhere in a folder, of pictures that are no frames, and of what else lies there."""
-    for place, others in places_with_frames(folder).items():
-        if place != files[0].parent:
+    files = read.files
+    for place, others in _all_places(folder).items():
+        if place != read.place:
             logger.warning(
                 "%s: images %s are not read (%s), only the %d %s",
                 folder,
                 _said(place, folder),
                 listed_files(others),
                 len(files),
-                _said(files[0].parent, folder),
+                _said(read.place, folder),
             )
     tell_about_pictures(folder, frames_among(_pictures(files[0].parent))[1])
     tell_what_is_not_read(folder)
@@ -175,25 +211,35 @@ def _tell_what_is_passed_over(folder: Path, files: list[Path]) -> None:
 
 def _files(folder: Path) -> list[Path]:
     extra = [folder / INTRINSICS_FILE, folder / MASK_FILE]
-    return sorted([*_images(folder), *(file for file in extra if file.is_file())])
+    read = _images(folder)
+    frames = [] if read is None else read.all_files
+    return sorted([*frames, *(file for file in extra if file.is_file())])
 
 
 def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
-    files = _images(folder)
-    if not files:
+    read = _images(folder, config.stereo_camera)
+    if read is None:
         raise SourceNotFoundError("no image in this folder", file=folder)
-    _tell_what_is_passed_over(folder, files)
+    _tell_what_is_passed_over(folder, read)
+    read.check_and_tell()
+    files = read.files
+    views = None if read.pairs else views_in_pictures(files, config.stereo_camera)
     width, height = image_size(files[0], frame=files[0].name)
-    K = read_intrinsics(folder, width, height, is_used=config.calibration is None)
+    pixel_aspect = 1.0
+    if views is not None:
+        pixel_aspect = views.pixel_aspect(width, height)
+        width, height = views.size(width, height)
+    K = read_intrinsics(folder, width, height, pixel_aspect=pixel_aspect, is_used=config.calibration is None)
     lens = Lens.pinhole(K, width, height)
     mask_file = mask_beside(folder, files[0].parent)
     return SourceFrames(
         frames=[PosedFrame(file.name, file, lens, mask_file=mask_file) for file in files],
         pose_file=folder,
         metric=False,
-        read_color=_Images(folder, [files[k] for k in spread(len(files), config.max_frames)]).image,
+        read_color=_Images(folder, [files[k] for k in spread(len(files), config.max_frames)], views).image,
         masks=_ContentMask(),
         intrinsics=stated_intrinsics(folder, config),
+        stereo_camera=config.stereo_camera if read.pairs or views is not None else None,
     )
 
 
@@ -203,10 +249,12 @@ class _Images:
     Args:
         folder: named in the warning.
         files: that will be read, in order.
+        views: where the view that is taken lies in each; None takes the whole picture.
     """
 
-    def __init__(self, folder: Path, files: list[Path]) -> None:
+    def __init__(self, folder: Path, files: list[Path], views: BothViews | None) -> None:
         self._folder = folder
+        self._views = views
         self._last = files[-1]
         self._looked_at = {files[k] for k in spread(len(files), _LOOKED_AT_FOR_COMBS)}
         self._combed: list[bool] = []
@@ -214,6 +262,8 @@ class _Images:
     def image(self, frame: PosedFrame) -> UInt8[np.ndarray, "h w 3"]:
         """The image of the next frame, as it lies on disk."""
         image = read_color(frame.file, frame=frame.label)
+        if self._views is not None:
+            image = self._views.view(image)
         if frame.file in self._looked_at:
             self._combed.append(is_combed(image))
         if frame.file == self._last and is_interlaced(self._combed):
@@ -245,15 +295,20 @@ class _ContentMask:
         )
 
 
+def _order(folder: Path) -> dict[str, Any]:
+    read = _images(folder)
+    return {} if read is None else order_for_fingerprint(file.name for file in read.all_files)
+
+
 READER = FolderReader(
     name="frames",
-    version=7,
+    version=8,
     summary="plain images in the folder, in images/ or in rgb/, optionally with intrinsics.json and mask.png",
     recognises=_recognises,
     files=_files,
     frames=_frames,
     conventions="no poses and no depth; the poses stage finds them, in an arbitrary unit",
-    chosen=lambda folder: order_for_fingerprint(file.name for file in _images(folder)),
+    chosen=_order,
 )
 
 

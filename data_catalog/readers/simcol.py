@@ -95,6 +95,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
         read_depth=lambda file, frame: decode_depth_mm(read_depth(file, frame=frame)),
         sampling=partial(LensSampling.planned, usual_downscale=_USUAL_DOWNSCALE),
         observed=partial(observed_by_depth, tolerance_mm=DEPTH_STEP_MM),
+        lens_stays="Its frames were rendered with that camera, and no other fits them",
     )
 
 

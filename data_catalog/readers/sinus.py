@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from data_catalog.calibration_files import LENS_OF_POSES
 from data_catalog.checks import check_intrinsics
 from data_catalog.dataset import Descriptor
 from data_catalog.folder_reader import FolderReader
@@ -76,6 +77,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
             LensSampling.planned, usual_downscale=_USUAL_DOWNSCALE, box=_bounding_box(mask, mask_file)
         ),
         points=read_points(folder),
+        lens_stays=LENS_OF_POSES,
     )
 
 

@@ -31,6 +31,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from data_catalog.calibration_files import LENS_OF_POSES
 from data_catalog.folder_reader import FolderReader
 from data_catalog.images import (
     COLOR_SUFFIXES,
@@ -175,6 +176,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
         read_depth=depth_of,
         points=None if points is None else points * scale,
         points_rgb=points_rgb,
+        lens_stays=LENS_OF_POSES,
     )
 
 

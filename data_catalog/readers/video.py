@@ -1,10 +1,11 @@
 """Reader of a video file: picks frames by motion and sharpness, masks what is not tissue; poses come later.
 
 A file with one of `VIDEO_SUFFIXES`, or a folder that holds one such file and fewer than four images, which a
-warning names (with more images in `images/` or `rgb/` it is refused). Beside the file, both
-optional: `intrinsics.json` and `mask.png`, as in `data_catalog.readers.frames_folder`; without the first a
-field of view of 90 degrees is assumed and said so until the poses stage estimates it, without the second the
-picture's outline and burnt-in text are found. How frames are chosen: `data_catalog.readers.footage_frames`.
+warning names (with more images in `images/` or `rgb/` it is refused). Of a stereo endoscope the frames of one
+camera are read (`data_catalog.readers.stereo_footage`). Beside the file, both optional: `intrinsics.json` and
+`mask.png`, as in `data_catalog.readers.frames_folder`; without the first a field of view of 90 degrees is
+assumed and said so until the poses stage estimates it, without the second the picture's outline and burnt-in
+text are found. How frames are chosen: `data_catalog.readers.footage_frames`.
 
 Frames are decoded by FFmpeg through PyAV: upright (a rotation in the container is applied), 8 bit a channel
 whatever the depth of the file, at the timestamps of the container, which may be uneven. Pixels that are not
@@ -16,7 +17,7 @@ every video whose header says that it is interlaced, OpenCV 5.0 gives empty pict
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from data_catalog.folder_reader import FolderReader
-from data_catalog.footage import VIDEO_SUFFIXES, FootageFrame, TimeSpan, files_of_kind
+from data_catalog.footage import VIDEO_SUFFIXES, Footage, FootageFrame, TimeSpan, files_of_kind
 from data_catalog.images import image_entries
 from data_catalog.posed_frames import SourceFrames
 from data_catalog.readers.beside_frames import listed_files, tell_what_is_not_read
@@ -37,10 +38,12 @@ from data_catalog.readers.frames_folder import (
     is_mask,
     places_with_frames,
 )
+from data_catalog.readers.stereo_footage import of_two_files
+from data_catalog.stereo import pairs_by_name
 from extrags.config import IngestConfig
 from extrags.errors import SourceError, SourceNotFoundError
 
-__all__ = ["READER", "VideoFile", "only_file", "tell_about_stills", "with_files_beside"]
+__all__ = ["READER", "VideoFile", "files_meant", "footage_meant", "with_files_beside"]
 
 logger = logging.getLogger(__name__)
 
@@ -50,6 +53,7 @@ _COUNTS_WHAT_IS_HIDDEN = "mp4"
 """Of the containers, this family alone: it counts frames that an edit list leaves out, as those between the
 last key frame and the beginning of a part that was cut out without coding it anew. Its durations are those of
 what is shown, and of a header that a truncated file has whole or not at all."""
+_CAMERAS = 2
 _UNSPECIFIED_COLOR = 2
 """What FFmpeg says of a matrix of colours that the file does not name."""
 _HIGH_DEFINITION_PX = (1280, 577)
@@ -176,23 +180,32 @@ class VideoFile:
             )
 
 
-def only_file(place: Path, suffixes: tuple[str, ...]) -> Path | None:
-    """The file that a path means: itself, or the only one of its kind in a folder without frames; else None.
+def files_meant(place: Path, suffixes: tuple[str, ...]) -> tuple[Path, ...]:
+    """The file that a path means: itself, or the only one of its kind in a folder without frames.
 
     Args:
         place: a file or a folder.
         suffixes: of the kind, in small letters.
+
+    Returns:
+        Nothing where no file is meant; two files, where a folder holds those of a left and a right camera by
+        their names, the left one first.
     """
     if place.is_file():
-        return place if place.suffix.lower() in suffixes else None
+        return (place,) if place.suffix.lower() in suffixes else ()
     if not place.is_dir():
-        return None
+        return ()
     found = files_of_kind(place, suffixes)
     stills = [file for file in image_entries(place) if not is_mask(file)]
-    return found[0] if len(found) == 1 and len(stills) < FEWEST_FRAMES else None
+    if len(stills) >= FEWEST_FRAMES:
+        return ()
+    stereo = pairs_by_name(found) if len(found) == _CAMERAS else None
+    if stereo is not None:
+        return stereo.pairs[0]
+    return tuple(found) if len(found) == 1 else ()
 
 
-def tell_about_stills(place: Path, file: Path) -> None:
+def _tell_about_stills(place: Path, file: Path) -> None:
     """Warn of the few pictures, and of poses, depth and masks, that lie beside a footage and are not read.
 
     Args:
@@ -216,40 +229,62 @@ def tell_about_stills(place: Path, file: Path) -> None:
         )
 
 
-def with_files_beside(file: Path) -> list[Path]:
-    """A footage and what belongs to it, sorted."""
-    beside = [file.parent / name for name in (INTRINSICS_FILE, MASK_FILE)]
-    return sorted([file, *(other for other in beside if other.is_file())])
+def with_files_beside(files: Sequence[Path]) -> list[Path]:
+    """A footage, of one camera or of two, and what belongs to it, sorted."""
+    if not files:
+        return []
+    beside = [files[0].parent / name for name in (INTRINSICS_FILE, MASK_FILE)]
+    return sorted([*files, *(other for other in beside if other.is_file())])
+
+
+def footage_meant(
+    place: Path, files: Sequence[Path], opened: Callable[[Path], Footage], config: IngestConfig
+) -> Footage:
+    """What is read of a path: the only file, or of two cameras' files that of one.
+
+    Args:
+        place: that was given.
+        files: of `files_meant`.
+        opened: opens a file.
+        config: the camera, and the part.
+
+    Raises:
+        SourceNotFoundError: there is no file.
+        SourceError: of two files, that do not agree.
+    """
+    if not files:
+        raise SourceNotFoundError("no video or DICOM file here", file=place)
+    file = files[0] if config.stereo_camera == "left" else files[-1]
+    _tell_about_stills(place, file)
+    footage = opened(file)
+    if len(files) == 1:
+        return footage
+    return of_two_files(footage, opened(next(other for other in files if other != file)), config)
 
 
 def _recognises(place: Path) -> bool:
-    return only_file(place, VIDEO_SUFFIXES) is not None
+    return bool(files_meant(place, VIDEO_SUFFIXES))
 
 
 def _files(place: Path) -> list[Path]:
-    file = only_file(place, VIDEO_SUFFIXES)
-    return [] if file is None else with_files_beside(file)
+    return with_files_beside(files_meant(place, VIDEO_SUFFIXES))
 
 
 def _frames(place: Path, config: IngestConfig) -> SourceFrames:
-    return footage_frames(_video(place), config)
+    return footage_frames(_footage(place, config), config)
 
 
 def _outline(place: Path, config: IngestConfig) -> SourceFrames:
-    return footage_outline(_video(place), config)
+    return footage_outline(_footage(place, config), config)
 
 
-def _video(place: Path) -> VideoFile:
-    file = only_file(place, VIDEO_SUFFIXES)
-    if file is None:
-        raise SourceNotFoundError("no video here", file=place)
-    tell_about_stills(place, file)
-    return VideoFile(file)
+def _footage(place: Path, config: IngestConfig) -> Footage:
+    return footage_meant(place, files_meant(place, VIDEO_SUFFIXES), VideoFile, config)
 
 
 READER = FolderReader(
     name="video",
-    version=6,
+    version=7,
     summary="a video file (mp4, avi, mov, mkv, ...), optionally with intrinsics.json and mask.png beside it",
     recognises=_recognises,
     files=_files,

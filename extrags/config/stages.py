@@ -24,6 +24,7 @@ from extrags.config.poses import PosesConfig
 from extrags.config.restorer import EnhanceConfig
 from extrags.config.settings import settings_of, unknown_setting
 from extrags.errors import ConfigError, PoseError
+from extrags.provenance import StereoCamera
 from extrags.thresholds import HOLE_ALPHA
 
 __all__ = [
@@ -40,6 +41,9 @@ __all__ = [
 
 class IngestConfig(StageConfig):
     """Reading of a source into an `EndoscopicSequence`."""
+
+    not_in_keys: ClassVar[frozenset[str]] = frozenset({"stereo_camera"})
+    """The fingerprint of the source has it where it is not the usual one, so that older artefacts stay."""
 
     width: int | None = Field(
         None, ge=16, le=4096, description="image width in pixels; None keeps the source's own"
@@ -95,6 +99,11 @@ class IngestConfig(StageConfig):
     end_s: float | None = Field(
         None, gt=0, description="of a video or DICOM file: read up to here, in seconds; None: to its end"
     )
+    stereo_camera: StereoCamera = Field(
+        "left",
+        description="of frames and videos of a stereo endoscope: whose are read. Refused where nothing tells "
+        "of two cameras, unless it is left; its choice counts in cache keys where it is right",
+    )
     field_of_view_deg: float | None = Field(
         None,
         ge=20,
@@ -112,9 +121,9 @@ class IngestConfig(StageConfig):
     calibration: str | None = Field(
         None,
         min_length=1,
-        description="calibration file of the endoscope, for sources that state no intrinsics: OpenCV (YAML "
-        "or XML), Kalibr (camchain), Scaramuzza (calib_results.txt); its content counts in cache keys, not "
-        "its path",
+        description="calibration file of the endoscope: OpenCV (YAML or XML), Kalibr (camchain), Scaramuzza "
+        "(calib_results.txt). It takes the place of intrinsics that are guessed or stated beside frames, and "
+        "is refused where poses were solved with others; its content counts in cache keys, not its path",
     )
 
 

@@ -39,6 +39,8 @@ def facts(inputs: ReportInputs) -> list[tuple[str, str]]:
     recordings = 1 if sequence.recording is None else len(np.unique(sequence.recording))
     if recordings > 1:
         facts.append(("Recordings", count(recordings)))
+    if sequence.stereo_camera is not None:
+        facts.append(("Camera", f"{sequence.stereo_camera} one of a stereo endoscope"))
     facts.append(("Scale", sequence.scale_words.removesuffix(" scale")))
     if sequence.intrinsics != "given":
         facts.append(("Focal length", intrinsics_in_words(sequence)))

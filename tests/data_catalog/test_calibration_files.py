@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,10 +15,14 @@ from PIL import Image
 from data_catalog import glance, read, resolve, source_fingerprint
 from data_catalog.c3vd.scaramuzza import ScaramuzzaCamera
 from data_catalog.calibration_files import read_calibration
+from data_catalog.inspection import inspect
 from data_catalog.readers import frames_folder
+from data_catalog.readers.colmap_model import write_colmap
+from data_catalog.readers.transforms_json import write_transforms
 from extrags.config import IngestConfig
 from extrags.errors import ConfigError, SourceError, SourceNotFoundError
 from extrags.lens import Lens
+from tests.data_catalog.layouts import write_endonerf
 
 WIDTH, HEIGHT = 160, 128
 K = np.array([[110.0, 0, 83.0], [0, 113.0, 60.5], [0, 0, 1]])
@@ -434,3 +439,47 @@ class TestPlainFrames:
         config = IngestConfig(calibration=str(opencv_file(tmp_path / "a.yml", [0.1, 0, 0, 0])))
         with pytest.raises(ConfigError, match="phantom/3@sparse states its intrinsics itself"):
             read("phantom/3@sparse", config)
+
+    @pytest.mark.parametrize("write", [write_transforms, write_colmap, write_endonerf])
+    def test_not_for_a_source_whose_poses_were_solved_with_its_own(self, clip, tmp_path, write) -> None:
+        write(clip, tmp_path / "source")
+        file = opencv_file(tmp_path / "a.yml", [0.1, 0, 0, 0], sized=False)
+        for look in (read, glance):
+            with pytest.raises(ConfigError, match=r"states its intrinsics itself\. Its poses were solved"):
+                look(tmp_path / "source", IngestConfig(calibration=str(file)))
+
+
+class TestInPlaceOfStatedIntrinsics:
+    def test_of_poses_json(self, posed_folder, tmp_path) -> None:
+        """It was refused, though a tracker's poses do not depend on the lens."""
+        stated = read(posed_folder)
+        other = stated.K[0] * [[1.05], [1.05], [1]] - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+        file = tmp_path / "scope.json"
+        file.write_text(json.dumps({"camera_matrix": other.tolist()}))
+        config = IngestConfig(calibration=str(file))
+        found = read(posed_folder, config)
+        assert found.intrinsics == "given"
+        np.testing.assert_allclose(found.K[:, 0, 0], 1.05 * stated.K[:, 0, 0])
+        np.testing.assert_array_equal(found.world_from_camera, stated.world_from_camera)
+        (finding,) = [item for item in inspect(posed_folder, config).findings if item.topic == "calibration"]
+        focal = stated.K[0, 0, 0]
+        told = f"focal length {focal:.1f} px there and {1.05 * focal:.1f} px in the file"
+        assert f"scope.json, takes the place of the intrinsics stated there: {told}" in finding.sentence
+        # The lower right corner is twice as far from the first pixel as the principal point.
+        corner = 0.05 * np.hypot(*stated.K[0, :2, 2])
+        median, most = re.findall(r"([\d.]+) px", finding.sentence)[-2:]
+        assert float(most) == pytest.approx(2 * corner, rel=0.05)
+        assert 0 < float(median) < corner * 2
+
+    @pytest.mark.parametrize("kind", ["fisheye", "scaramuzza"])
+    def test_of_another_kind(self, posed_folder, tmp_path, kind) -> None:
+        if kind == "fisheye":
+            content = {"camera_matrix": read(posed_folder).K[0].tolist()}
+            file = tmp_path / "scope.json"
+            file.write_text(json.dumps({**content, "distortion_coefficients": [0.1, 0, 0, 0], "fisheye": 1}))
+        else:
+            file = tmp_path / "calib_results.txt"
+            file.write_text(OCAMCALIB.replace("128 160", "40 48").replace("62.25 78.5", "20 24"))
+        config = IngestConfig(calibration=str(file))
+        (finding,) = [item for item in inspect(posed_folder, config).findings if item.topic == "calibration"]
+        assert "px apart in the median over the image" in finding.sentence

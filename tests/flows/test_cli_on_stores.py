@@ -181,6 +181,7 @@ class TestCache:
     def test_ls_as_json(self, store: str, capsys: pytest.CaptureFixture[str]) -> None:
         assert main(["cache", "ls", "phantom/1", "--store", store, "--json", "-"]) == 0
         (item,) = json.loads(capsys.readouterr().out)
+        assert undocumented(item, "an-artefact") == []
         assert item["key"] == "toy-v1-1"
 
     def test_verify_finds_damage(self, store: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -204,6 +205,7 @@ class TestCache:
         (Path(store) / "artefacts" / "toy-v1-1" / "file").unlink()
         assert main(["cache", "verify", "--repair", "--store", store, "--json", "-"]) == 1
         found = json.loads(capsys.readouterr().out)
+        assert undocumented(found, "cache-verify") == []
         (row,) = found.pop("damaged")
         assert found == {"store": store, "artefacts": 3}
         assert (row["stage"], row["key"], row["file"]) == ("toy", "toy-v1-1", "file")

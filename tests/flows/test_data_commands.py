@@ -20,6 +20,7 @@ from flows.cli import main
 from flows.methods import method_config
 from flows.runners import DirectRunner
 from flows.wiring import run_sequence
+from tests.documented_json import undocumented, undocumented_items
 from tests.flows.tiny import SEQUENCE, TINY
 
 pytestmark = pytest.mark.usefixtures("untouched_environment")
@@ -65,12 +66,12 @@ class TestList:
         assert main(["data", "list", "phantom", "--here", "--json", "-"]) == 0
         listed = json.loads(capsys.readouterr().out)
         assert listed
+        assert undocumented_items(listed, "a-catalogue-entry") == []
         assert all(item["name"].startswith("phantom/") and item["available"] for item in listed)
         assert main(["data", "list", "s*/*", "--json", "-"]) == 0
-        assert {item["name"] for item in json.loads(capsys.readouterr().out)} >= {
-            "sinus/hopkins",
-            "simcol3d/s1",
-        }
+        listed = json.loads(capsys.readouterr().out)
+        assert undocumented_items(listed, "a-catalogue-entry") == []
+        assert {item["name"] for item in listed} >= {"sinus/hopkins", "simcol3d/s1"}
 
 
 class TestShow:
@@ -79,10 +80,17 @@ class TestShow:
         arguments = ["data", "show", "phantom/5@sparse", *SMALL, "--picture", str(picture), "--json", "-"]
         assert main(arguments) == 0
         shown = json.loads(capsys.readouterr().out)
+        assert undocumented(shown, "data-show") == []
         assert shown["frames"] == 48
         assert shown["measured"]["frames"] == 8
         assert shown["measured"]["has_depth"] is True
         assert np.array(Image.open(picture)).shape[2] == 3
+
+    def test_a_folder_as_json(self, scene: str, capsys: pytest.CaptureFixture[str]) -> None:
+        assert main(["data", "show", scene, "--json", "-"]) == 0
+        shown = json.loads(capsys.readouterr().out)
+        assert undocumented(shown, "data-show") == []
+        assert shown["paths"] == [scene]
 
     def test_a_folder_as_a_table(self, scene: str, capsys: pytest.CaptureFixture[str]) -> None:
         assert main(["data", "show", scene]) == 0
@@ -96,6 +104,7 @@ class TestShow:
         monkeypatch.setattr("data_catalog.named_folders.data_roots", lambda: [tmp_path])
         assert main(["data", "show", "sinus/hopkins", "--json", "-"]) == 0
         shown = json.loads(capsys.readouterr().out)
+        assert undocumented(shown, "data-show") == []
         assert shown["available"] is False
         assert shown["measured"] is None
         assert main(["data", "show", "sinus/hopkins", "--picture", str(tmp_path / "x.png")]) == 1
@@ -112,10 +121,14 @@ class TestCheck:
         assert "nothing is wrong" in said
         assert "the folder is empty" in said
 
-    def test_as_json(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def test_as_json(self, scene: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         (tmp_path / "poses.json").write_text("{")
-        assert main(["data", "check", str(tmp_path), "--json", "-"]) == 1
-        (found,) = json.loads(capsys.readouterr().out)
+        assert main(["data", "check", str(tmp_path), scene, "--json", "-"]) == 1
+        inspections = json.loads(capsys.readouterr().out)
+        assert undocumented_items(inspections, "an-inspection") == []
+        found, right = inspections
+        assert right["ok"] is True
+        assert right["facts"]["has_depth"] is True
         assert found["ok"] is False
         (finding,) = found["findings"]
         assert finding["kind"] == "error"

@@ -20,6 +20,7 @@ from flows.cli import main
 from flows.outcome import SequenceOutcome
 from flows.runners import DirectRunner, StoreRunner
 from flows.wiring import run_sequence
+from tests.documented_json import undocumented, undocumented_items
 from tests.flows.tiny import SEQUENCE, tiny_config
 
 
@@ -129,6 +130,7 @@ class TestCommand:
         assert store.keys() == before
         assert main([*arguments, "--json", "-"]) == 0
         found = json.loads(capsys.readouterr().out)
+        assert undocumented(found, "cache-gc") == []
         assert sorted(item["key"] for item in found["artefacts"]) == before
         assert store.keys() == []
 
@@ -183,5 +185,6 @@ class TestCommand:
         assert SEQUENCE in capsys.readouterr().out
         assert main(["cache", "usage", "--store", store.root, "--json", "-"]) == 0
         rows = json.loads(capsys.readouterr().out)
+        assert undocumented_items(rows, "usage-of-a-sequence") == []
         assert SEQUENCE in {row["sequence"] for row in rows}
         assert sum(row["artefacts"] for row in rows) == len(store.keys())

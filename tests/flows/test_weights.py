@@ -18,6 +18,7 @@ from flows.runners import DirectRunner
 from flows.tables import benchmark_markdown, difference_figures, sequence_markdown, table_figures
 from flows.wiring import run_sequence
 from tasks.weights import lpips_weights
+from tests.documented_json import undocumented_items
 from tests.flows.tiny import SEQUENCE, tiny_config
 
 pytestmark = pytest.mark.usefixtures("untouched_environment")
@@ -105,6 +106,7 @@ class TestCommand:
         monkeypatch.setenv(WEIGHTS_VARIABLE, str(shared_data / "lpips_weights"))
         assert main(["weights", "lpips", "--json", "-"]) == 0
         found = json.loads(capsys.readouterr().out)
+        assert undocumented_items(found, "a-network") == []
         assert [case["net"] for case in found] == ["alex", "vgg"]
         assert [Path(*case["files"]).name for case in found] == ["lpips_alex_v0.1.npz", "lpips_vgg_v0.1.npz"]
 
