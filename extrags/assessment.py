@@ -1,4 +1,4 @@
-"""Assessment of a coarse scene: holes and poorly seen surface, measured in probe views."""
+"""Assessment of a coarse scene: holes and unresolved surface, measured in probe views."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch.nn import functional
 
 from extrags.cameras import Cameras, rotation_about
@@ -16,6 +16,7 @@ from extrags.errors import CaptureError
 from extrags.events import Progress, emit
 from extrags.exploration.coverage import direction_counts, training_coverage
 from extrags.exploration.waves import start_views
+from extrags.raster import Rendering
 from extrags.scene import Scene
 from extrags.scene_plan import ScenePlan, decide
 from extrags.sequence import EndoscopicSequence
@@ -58,19 +59,20 @@ def assess(scene: Scene, sequence: EndoscopicSequence, config: PipelineConfig | 
 def measure(
     scene: Scene, sequence: EndoscopicSequence, settings: AssessConfig, coverage: CoverageConfig
 ) -> dict[str, float]:
-    """Measure holes and poorly seen surface in probe views near the training views.
+    """Measure holes and unresolved surface in probe views near the training views.
 
-    A pixel of a probe view is lacking when it is a hole (alpha below `hole_alpha`) or when more than half of
-    its alpha comes from Gaussians that the training views saw from fewer than `min_directions` direction
-    bins. What a training view shows outside its mask was not seen by it. Budgets are not used here: `decide`
-    turns the numbers into a plan.
+    A pixel of a probe view is a hole where alpha is below `hole_alpha`. A Gaussian is unresolved in a probe
+    as far as the training view that shows it largest, inside its mask, has fewer than `sufficient_resolution`
+    times the pixels that the probe has of it. Sizes are sums of blending weights: how many Gaussians a
+    surface is made of makes little difference. What a probe lacks are its holes and, with `unresolved_weight`,
+    its unresolved pixels. Budgets are not used here: `decide` turns the numbers into a plan.
 
     Args:
-        scene: the coarse reconstruction; probe views are rendered where it is.
+        scene: the coarse reconstruction.
         sequence: its frames.
-        settings: the probe views, and the thresholds for lacking pixels.
-        coverage: when a Gaussian counts as seen; as in the exploration, which takes all pixels of training
-            views, though. By the frustum no masks are looked at.
+        settings: the probe views, and what they lack.
+        coverage: when a Gaussian counts as seen from a direction; as in the exploration, which takes all
+            pixels of training views, though. By the frustum no masks are looked at.
 
     Returns:
         Measurements by name; shares are of all pixels of the probe views, of the valid ones of the training
@@ -93,18 +95,19 @@ def measure(
     covered = training_coverage(on_processor, small, **coverage.options, mask=valid)
     directions = direction_counts(covered)
     probes = probe_views(on_processor, small.as_pinholes(), depth_unit_mm, settings)
-    holes, poor = _lacking_pixels(scene, probes, directions < settings.min_directions, settings)
-    lacking = float((holes | poor).mean())
+    holes, unresolved = _lacking_shares(
+        on_processor, probes, _largest_sizes(on_processor, small, valid), settings
+    )
+    lacking = holes + settings.unresolved_weight * unresolved
     seen = directions > 0
     measurements = {
-        "lacking_share": lacking,
+        "lacking_share": float(lacking.mean()),
         "hole_share": float(holes.mean()),
-        "poor_share": float(poor.mean()),
-        "worst_probe_lacking_share": float((holes | poor).mean(axis=(1, 2)).max()),
+        "unresolved_share": float(unresolved.mean()),
+        "worst_probe_lacking_share": float(lacking.max()),
         "training_hole_share": training_holes,
         "gaussians": float(len(directions)),
         "gaussians_unseen_share": float(1 - seen.mean()),
-        "gaussians_poorly_seen_share": float((directions < settings.min_directions).mean()),
         "directions_mean": float(directions[seen].mean()) if seen.any() else 0.0,
         "directions_median": float(np.median(directions[seen])) if seen.any() else 0.0,
         "coverage_share": float(directions.mean()) / coverage.directions,
@@ -115,10 +118,9 @@ def measure(
         "probe_views": float(len(probes)),
     }
     _log.info(
-        "assess: %.1f %% of probe pixels lack something (%.1f %% holes, %.1f %% poorly seen)",
-        100 * lacking,
+        "assess: %.2f %% of probe pixels are holes, %.2f %% unresolved surface",
         100 * measurements["hole_share"],
-        100 * measurements["poor_share"],
+        100 * measurements["unresolved_share"],
     )
     return measurements
 
@@ -204,16 +206,51 @@ def _training_view_measurements(
     return float(np.median(depth)), float(np.concatenate(holes).mean())
 
 
-def _lacking_pixels(
-    scene: Scene, probes: Cameras, poorly_seen: np.ndarray, config: AssessConfig
-) -> tuple[np.ndarray, np.ndarray]:
-    """Masks [P, H, W] of the probes' holes, and of other pixels made mostly of poorly seen Gaussians."""
-    flag = torch.from_numpy(poorly_seen.astype(np.float32))[:, None]
-    holes, poor = [], []
+def _largest_sizes(
+    scene: Scene, cameras: Cameras, valid: Bool[np.ndarray, "v h w"]
+) -> Float[np.ndarray, "n"]:
+    """Pixels that each Gaussian has in the training view that shows it largest, inside the masks."""
+    largest = np.zeros(len(scene.gaussians), dtype=np.float32)
+    with torch.no_grad():
+        for start in range(0, len(cameras), PROBES_PER_BATCH):
+            batch = slice(start, start + PROBES_PER_BATCH)
+            sizes = _sizes(
+                scene.render(
+                    cameras[batch],
+                    visibility=True,
+                    visibility_mask=torch.from_numpy(valid[batch]),
+                    sh_degree=0,
+                )
+            )
+            largest = np.maximum(largest, sizes.max(axis=0))
+    return largest
+
+
+def _lacking_shares(
+    scene: Scene, probes: Cameras, largest_px: Float[np.ndarray, "n"], config: AssessConfig
+) -> tuple[Float[np.ndarray, "p"], Float[np.ndarray, "p"]]:
+    """Of each probe the share of holes, and that of surface that no training view resolves.
+
+    Args:
+        scene: the coarse reconstruction.
+        probes: the P probe views.
+        largest_px: size of each Gaussian in the training view that shows it largest.
+        config: what a hole is, and which share of a probe's size is enough.
+    """
+    holes, unresolved = [], []
     with torch.no_grad():
         for start in range(0, len(probes), PROBES_PER_BATCH):
-            shares, alpha = scene.render_attributes(probes[start : start + PROBES_PER_BATCH], flag)
-            hole = alpha < config.hole_alpha
-            holes.append(hole.cpu().numpy())
-            poor.append(((shares[..., 0] > 0.5 * alpha) & ~hole).cpu().numpy())
-    return np.concatenate(holes), np.concatenate(poor)
+            rendering = scene.render(probes[start : start + PROBES_PER_BATCH], visibility=True, sh_degree=0)
+            sizes = _sizes(rendering).astype(np.float64)
+            missing = np.maximum(0.0, sizes - largest_px / config.sufficient_resolution)
+            hole = (rendering.alpha < config.hole_alpha).double().mean(dim=(1, 2)).numpy()
+            holes.append(hole)
+            # What is faint in holes has sizes as well.
+            unresolved.append(np.minimum(1 - hole, missing.sum(axis=1) / rendering.alpha[0].numel()))
+    return np.concatenate(holes), np.concatenate(unresolved)
+
+
+def _sizes(rendering: Rendering) -> Float[np.ndarray, "v n"]:
+    """Pixels that each Gaussian has in each view: the sum of its blending weights."""
+    assert rendering.visibility_sum is not None
+    return np.asarray(rendering.visibility_sum.numpy())

@@ -142,7 +142,7 @@ def _decisions(lacking: float, config: PipelineConfig) -> tuple[Decision, ...]:
     settings = config.assess
     needed = lacking > settings.min_hole_share
     run = needed or settings.force
-    share = f"{100 * lacking:.2f} % of the pixels of nearby views are holes or poorly seen"
+    share = f"holes and unresolved surface are {100 * lacking:.2f} % of nearby views"
     limit = f"{100 * settings.min_hole_share:.2f} %"
     if needed:
         why = f"{share}, more than {limit}"
@@ -158,7 +158,7 @@ def _decisions(lacking: float, config: PipelineConfig) -> tuple[Decision, ...]:
     views = min(config.enhance.max_views, trajectories * (config.explore.length - 1))
     spent = (
         f"{trajectories} of {config.explore.trajectories} trajectories "
-        f"(all of them from {100 * settings.full_budget_share:.0f} % on)"
+        f"(all of them from {100 * settings.full_budget_share:.3g} % on)"
     )
     if trajectories < wanted:
         spent += f", not {wanted}: enhance.max_views={config.enhance.max_views} allows no more"

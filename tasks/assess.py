@@ -49,7 +49,7 @@ def planning_settings(config: PipelineConfig) -> PipelineConfig:
     return PipelineConfig().with_overrides(read)
 
 
-@stage("assess", version=4)
+@stage("assess", version=5)
 def assess(
     slot: Slot,
     scene: Ref,
@@ -74,7 +74,7 @@ def assess(
     slot.counts["lacking_share"] = found["lacking_share"]
 
 
-@stage("plan", version=6)
+@stage("plan", version=7)
 def plan(slot: Slot, measured: Ref, config: PipelineConfig) -> None:
     """Derive the plan from the measurements and the budgets of the run; writes `plan.json`."""
     from extrags.scene_plan import decide

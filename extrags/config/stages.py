@@ -139,18 +139,28 @@ class AssessConfig(StageConfig):
     probe_offset: float = Field(0.35, gt=0, description="sideways offset of a probe, in median depths")
     probe_turn_deg: float = Field(35.0, ge=0, description="turn of a probe")
     hole_alpha: float = Field(HOLE_ALPHA, gt=0, lt=1, description="a pixel below this alpha is a hole")
-    min_hole_share: float = Field(
-        0.04,
+    sufficient_resolution: float = Field(
+        0.4,
+        gt=0,
+        description="surface is resolved where a training view has this share of the pixels that a probe has "
+        "of it; as explore.sufficient_resolution",
+    )
+    unresolved_weight: float = Field(
+        1 / 3,
         ge=0,
         le=1,
-        description="explore, restore and judge only when holes and poorly seen pixels exceed this share; a "
-        "scene that lacks less is fine-tuned on its real views alone",
+        description="what a pixel of unresolved surface counts beside a hole; as explore.unresolved_error "
+        "beside explore.hole_error",
     )
-    min_directions: int = Field(
-        2, ge=1, description="a Gaussian seen from fewer direction bins counts as poorly seen"
+    min_hole_share: float = Field(
+        0.015,
+        ge=0,
+        le=1,
+        description="explore, restore and judge only when holes and unresolved pixels, these by their "
+        "weight, exceed this share; a scene that lacks less is fine-tuned on its real views alone",
     )
     full_budget_share: float = Field(
-        0.2, gt=0, le=1, description="share of lacking pixels from which the whole budget is used"
+        0.075, gt=0, le=1, description="share of lacking pixels from which the whole budget is used"
     )
     force: bool = Field(False, description="run every stage whatever the measurements say")
     seed: Seed = Field(0, description="seed of all random sampling")

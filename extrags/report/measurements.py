@@ -12,14 +12,13 @@ __all__ = ["measured_figure", "measurement_rows"]
 Kind = Literal["share", "count", "number", "length", "pixels"]
 
 _LABELS: dict[str, tuple[str, Kind]] = {
-    "lacking_share": ("Pixels of nearby views that lack something", "share"),
+    "lacking_share": ("What nearby views lack: holes, and unresolved surface by its weight", "share"),
     "hole_share": ("Holes in nearby views", "share"),
-    "poor_share": ("Poorly seen surface in nearby views", "share"),
-    "worst_probe_lacking_share": ("Lacking pixels of the worst nearby view", "share"),
+    "unresolved_share": ("Unresolved surface in nearby views", "share"),
+    "worst_probe_lacking_share": ("The same of the worst nearby view", "share"),
     "training_hole_share": ("Holes in the training views", "share"),
     "gaussians": ("Gaussians", "count"),
     "gaussians_unseen_share": ("Gaussians that no training view sees", "share"),
-    "gaussians_poorly_seen_share": ("Gaussians seen from few directions", "share"),
     "directions_mean": ("Directions that see a Gaussian, mean", "number"),
     "directions_median": ("Directions that see a Gaussian, median", "number"),
     "coverage_share": ("Covered (Gaussian, direction) pairs", "share"),
