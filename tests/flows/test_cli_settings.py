@@ -73,6 +73,12 @@ class TestRunners:
         [
             ("dsk", "no task runner 'dsk'; expected threads, dask or dask:ADDRESS; did you mean dask?"),
             ("threads:4", "no task runner 'threads:4'; expected threads, dask or dask:ADDRESS (see"),
+            ("dask:nonsense", "nonsense is no address of a Dask scheduler; expected HOST:PORT, or"),
+            ("dask:tcp://127.0.0.1", "tcp://127.0.0.1 is no address of a Dask scheduler"),
+            ("dask:tcp://:8786", "tcp://:8786 is no address of a Dask scheduler"),
+            ("dask:tpc://127.0.0.1:8786", "tpc://127.0.0.1:8786 is no address of a Dask scheduler"),
+            ("dask:node-1:99999", "node-1:99999 is no address of a Dask scheduler"),
+            ("dask:::1:8786", "::1:8786 is no address of a Dask scheduler"),
         ],
     )
     def test_an_unknown_one_is_refused_by_the_parser(self, verb: str, name: str, message: str) -> None:
@@ -80,6 +86,12 @@ class TestRunners:
             parser(verb).parse_args([verb, SEQUENCE, "--runner", name])
         assert message in str(caught.value)
 
-    @pytest.mark.parametrize("name", ["threads", "dask", "dask:tcp://127.0.0.1:8786"])
+    @pytest.mark.parametrize(
+        "name",
+        [
+            *("threads", "dask", "dask:tcp://127.0.0.1:8786", "dask:node-1.cluster:8786"),
+            *("dask:tls://[::1]:8786", "dask:[fe80::1%eth0]:8786"),
+        ],
+    )
     def test_known_ones(self, name: str) -> None:
         assert parser("run").parse_args(["run", SEQUENCE, "--runner", name]).runner == name
