@@ -95,3 +95,36 @@ class TestRunners:
     )
     def test_known_ones(self, name: str) -> None:
         assert parser("run").parse_args(["run", SEQUENCE, "--runner", name]).runner == name
+
+
+class TestLimits:
+    """Limits are looked at by the parser: what is in the store already needs no flow that would."""
+
+    @pytest.mark.parametrize("verb", ["run", "plan", "benchmark"])
+    @pytest.mark.parametrize(
+        ("option", "value", "expected"),
+        [
+            ("--retries", "-1", "a whole number from 0 to 10"),
+            ("--retries", "11", "a whole number from 0 to 10"),
+            ("--retries", "few", "a whole number from 0 to 10"),
+            ("--stage-time-limit", "0", "a finite number above 0"),
+            ("--stage-time-limit", "nan", "a finite number above 0"),
+            ("--stage-time-limit", "inf", "a finite number above 0"),
+        ],
+    )
+    def test_out_of_range(self, verb: str, option: str, value: str, expected: str) -> None:
+        with pytest.raises(ConfigError) as caught:
+            parser(verb).parse_args([verb, SEQUENCE, option, value])
+        assert f"argument {option}: {value}; expected {expected} (see" in str(caught.value)
+
+    @pytest.mark.parametrize("value", ["-1", "0", "much"])
+    def test_memory_out_of_range(self, value: str) -> None:
+        with pytest.raises(ConfigError) as caught:
+            parser("run").parse_args(["run", SEQUENCE, "--memory-limit", value])
+        assert f"argument --memory-limit: {value}; expected a finite number above 0" in str(caught.value)
+
+    def test_in_range(self) -> None:
+        given = parser("run").parse_args(
+            ["run", SEQUENCE, "--retries", "0", "--stage-time-limit", "0.5", "--memory-limit", "6"]
+        )
+        assert (given.retries, given.stage_time_limit, given.memory_limit) == (0, 0.5, 6.0)
