@@ -70,6 +70,14 @@ class TestConfig:
             PipelineConfig().with_overrides({path: 1})
 
     @pytest.mark.parametrize(
+        ("overrides", "message"),
+        [(["coarse.iterations"], "settings are list; expected a mapping"), ({3: 1}, "no setting 3;")],
+    )
+    def test_what_is_no_mapping_of_settings(self, overrides: Any, message: str) -> None:
+        with pytest.raises(ConfigError, match=message):
+            PipelineConfig().with_overrides(overrides)
+
+    @pytest.mark.parametrize(
         ("name", "value", "expected"),
         [
             ("coarse.iterations", -7, "is -7; expected a whole number of at least 1"),

@@ -105,6 +105,16 @@ class TestFromArrays:
     @pytest.mark.parametrize(
         ("field", "value", "kind", "message"),
         [
+            ("metric", "no", ConfigError, "arrays: metric is 'no', expected True or False"),
+            ("metric", 1, ConfigError, "metric is 1, expected True or False"),
+            ("name", None, ConfigError, "name is None, expected a text"),
+            ("name", 3, ConfigError, "name is 3, expected a text"),
+            (
+                "frame_names",
+                ["a"] * 2 + [f"b{k}" for k in range(8)],
+                SourceError,
+                "two frames are called 'a'",
+            ),
             ("rgb", np.zeros((4, 12, 16), np.uint8), ShapeError, r"rgb is uint8 \(4, 12, 16\)"),
             ("rgb", np.zeros((4, 12, 16, 4), np.uint8), ShapeError, "expected uint8 or float"),
             ("rgb", np.zeros((0, 12, 16, 3), np.uint8), ShapeError, "rgb is"),
