@@ -8,7 +8,7 @@ import numpy as np
 
 from extrags.errors import ShapeError
 
-__all__ = ["check_array", "check_instance"]
+__all__ = ["check_array", "check_instance", "check_whole"]
 
 
 def check_array(value: object, what: str, shape: tuple[int | None, ...], kind: type[Any]) -> None:
@@ -43,3 +43,13 @@ def check_instance(value: object, what: str, expected: type[object]) -> None:
     """
     if not isinstance(value, expected):
         raise ShapeError(f"{what} is {type(value).__name__}, expected {expected.__name__}")
+
+
+def check_whole(what: str, value: object) -> None:
+    """Refuse what is no whole number of pixels.
+
+    Raises:
+        ShapeError: says what was found and what was expected.
+    """
+    if not isinstance(value, int | np.integer) or isinstance(value, bool):
+        raise ShapeError(f"{what} is {value!r}, expected a whole number of pixels")

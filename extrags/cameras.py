@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from extrags.array_shapes import check_instance, check_whole
 from extrags.errors import PoseError, ShapeError
 from extrags.radial_lens import VIRTUAL_FIELD_DEG, RadialLens
 
@@ -52,7 +53,7 @@ class Cameras:
         lens: how rays are bent before `K`; None for pinholes.
 
     Raises:
-        ShapeError: when the arrays do not fit each other.
+        ShapeError: when the arrays do not fit each other, or the size is no size.
     """
 
     K: Float[np.ndarray, "c 3 3"]
@@ -62,7 +63,13 @@ class Cameras:
     lens: RadialLens | None = None
 
     def __post_init__(self) -> None:
-        n = self.world_from_camera.shape[0]
+        check_instance(self.K, "Cameras: K", np.ndarray)
+        check_instance(self.world_from_camera, "Cameras: world_from_camera", np.ndarray)
+        check_whole("Cameras: width", self.width)
+        check_whole("Cameras: height", self.height)
+        if self.width < 1 or self.height < 1:
+            raise ShapeError(f"Cameras of {self.width} x {self.height} px, expected at least 1 x 1")
+        n = len(self.world_from_camera)
         if self.world_from_camera.shape != (n, 4, 4) or self.K.shape != (n, 3, 3):
             raise ShapeError(
                 f"Cameras need K [C, 3, 3] and world_from_camera [C, 4, 4], "

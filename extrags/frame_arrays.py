@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float, Real, UInt8
 
-from extrags.errors import ShapeError, SourceError
+from extrags.errors import ConfigError, ShapeError, SourceError
 from extrags.frame_stacks import stacked
 from extrags.known_depth import is_background
 from extrags.scarce_depth import without_scarce_depth
@@ -54,14 +55,20 @@ def sequence_from_arrays(
         frame_names: one per frame, for messages.
 
     Raises:
+        ConfigError: the name is no text, or `metric` neither true nor false.
         ShapeError: sizes or types do not fit, or the split names frames that are not there.
         PoseError: a pose is no rigid motion: mirrored, scaled, transposed or not finite.
         SourceError: colours out of range, intrinsics that are no pinhole of this size, negative depth, no
-            depth at all, a mask without a pixel, a frame in both parts of the split; names frame and field.
+            depth at all, a mask without a pixel, a frame in both parts of the split, two frames of one name;
+            names frame and field.
 
     Returns:
         The sequence; arrays that need no conversion are not copied.
     """
+    if not isinstance(name, str):
+        raise ConfigError(f"name is {name!r}, expected a text")
+    if not isinstance(metric, bool | np.bool_):
+        raise ConfigError(f"{name}: metric is {metric!r}, expected True or False")
     rgb = np.asarray(rgb)
     if rgb.ndim != 4 or rgb.shape[-1] != 3 or not len(rgb):
         raise ShapeError(f"{name}: rgb is {rgb.dtype} {rgb.shape}, expected uint8 or float [F, H, W, 3]")
@@ -69,6 +76,9 @@ def sequence_from_arrays(
     labels = tuple(frame_names) or tuple(f"{k:04d}" for k in range(frames))
     if len(labels) != frames:
         raise ShapeError(f"{name}: {len(labels)} frame names for {frames} frames")
+    repeated = [label for label, count in Counter(labels).items() if count > 1]
+    if repeated:
+        raise SourceError(f"{name}: two frames are called {repeated[0]!r}", field="frame_names")
     K = _numbers(K, f"{name}: K").astype(np.float64, copy=False)
     mask = np.ones((height, width), dtype=np.bool_) if mask is None else np.asarray(mask)
     sequence = EndoscopicSequence(
@@ -80,7 +90,7 @@ def sequence_from_arrays(
         world_from_camera=None if world_from_camera is None else _rigid(world_from_camera, labels),
         depth_mm=None if depth_mm is None else _without_gaps(_numbers(depth_mm, f"{name}: depth_mm")),
         specular=None if specular is None else np.asarray(specular),
-        metric=metric,
+        metric=bool(metric),
         frame_names=labels,
     )
     check_arrays(sequence)

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from extrags.array_files import load_ply_vertices
-from extrags.errors import CaptureError, ShapeError, SourceError, SourceNotFoundError
+from extrags.errors import CaptureError, NonFiniteError, ShapeError, SourceError, SourceNotFoundError
 from extrags.zarr_io import new_group, open_group, read_array, write_array
 
 __all__ = ["SH_C0", "Gaussians"]
@@ -177,9 +177,16 @@ class Gaussians:
 
         Raises:
             CaptureError: when there are no Gaussians, which readers of none of the formats expect.
+            NonFiniteError: when a parameter is NaN or infinite, which they refuse as well.
         """
         if not len(self):
             raise CaptureError(f"there are no Gaussians to write into {path}")
+        for name, value in self.parameters().items():
+            wrong = int((~torch.isfinite(value.detach().reshape(len(self), -1))).any(dim=1).sum())
+            if wrong:
+                raise NonFiniteError(
+                    f"{name} of {wrong} of {len(self)} Gaussians hold NaN or infinity; {path} is not written"
+                )
         return self.detached().to("cpu")
 
     def write_ply(self, path: Path) -> None:
@@ -190,6 +197,7 @@ class Gaussians:
 
         Raises:
             CaptureError: when there are no Gaussians.
+            NonFiniteError: when a parameter is NaN or infinite.
         """
         from plyfile import PlyData, PlyElement
 

@@ -174,13 +174,15 @@ class InMemoryPipeline(Pipeline):
         return 0 if self.result.exploration is None else self.result.exploration.n_virtual
 
     def ingest(self) -> None:
-        """The sequence was read by the caller; device and kernels are looked at before anything is made."""
+        """The sequence was read by the caller; what is wrong elsewhere is said before anything is made."""
+        from extrags.metrics.photometric import try_added_metrics
         from extrags.placement import check_device, run_device
         from extrags.raster import native_isa
 
         native_isa()  # refuses an EXTRAGS_ISA that is not usable
         check_device(self.config)
         self._device = run_device(self.config)
+        try_added_metrics(self._device)
 
     def poses(self) -> None:
         """`extrags.poses.estimate_poses`; frames that cannot be registered are dropped."""

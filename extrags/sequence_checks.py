@@ -13,7 +13,19 @@ from extrags.cameras import as_rotation
 from extrags.errors import PoseError, SourceError
 from extrags.sequence import EndoscopicSequence
 
-__all__ = ["check_arrays", "check_depth", "check_intrinsics", "check_pose", "check_split"]
+__all__ = [
+    "SMALLEST_SIDE_PX",
+    "check_arrays",
+    "check_depth",
+    "check_image_size",
+    "check_intrinsics",
+    "check_pose",
+    "check_split",
+]
+
+SMALLEST_SIDE_PX = 6
+"""Of frames: SSIM, in which every run ends, mirrors half its window of 11 pixels at the edges. What the
+catalogue reads has more (`data_catalog.resampling`)."""
 
 
 def check_arrays(sequence: EndoscopicSequence, *, file: object = None) -> None:
@@ -25,9 +37,10 @@ def check_arrays(sequence: EndoscopicSequence, *, file: object = None) -> None:
 
     Raises:
         PoseError: a pose that is not a rigid motion.
-        SourceError: a split that leaks or repeats a frame, intrinsics that are no pinhole, a frame without
-            any valid pixel, or depth that is no depth; names frame and field.
+        SourceError: frames too small, a split that leaks or repeats a frame, intrinsics that are no pinhole,
+            a frame without any valid pixel, or depth that is no depth; names frame and field.
     """
+    check_image_size(sequence.width, sequence.height, file=file)
     check_split(sequence, file=file)
     for index in range(len(sequence)):
         name = sequence.frame_name(index)
@@ -40,6 +53,20 @@ def check_arrays(sequence: EndoscopicSequence, *, file: object = None) -> None:
             depth = getattr(sequence, field)
             if depth is not None:
                 check_depth(depth[index], frame=name, file=file, field=field)
+
+
+def check_image_size(width: int, height: int, *, file: object = None) -> None:
+    """Refuse frames that are too small for any run to end well.
+
+    Raises:
+        SourceError: says the smallest size.
+    """
+    if min(width, height) < SMALLEST_SIDE_PX:
+        raise SourceError(
+            f"frames of {width} x {height} px; expected at least {SMALLEST_SIDE_PX} px a side",
+            file=file,
+            field="rgb",
+        )
 
 
 def check_split(sequence: EndoscopicSequence, *, file: object = None) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Collection
 
 from extrags.config import PipelineConfig
 from extrags.errors import WeightsError
+from extrags.metrics.registry import added_metrics
 from extrags.stages import stages_until
 
 __all__ = ["preflight"]
@@ -24,8 +25,8 @@ def preflight(config: PipelineConfig, until: str, leave_out: Collection[str] = (
         WeightsError: when weights are not there; says how to get them.
         MissingDependencyError: when a package is not there; says how to install it.
         SourceNotFoundError: when there is no such file as `imported.scene`.
-        ConfigError: when settings do not fit each other, the model or the machine, or EXTRAGS_ISA names an
-            instruction set that is not usable here.
+        ConfigError: when settings do not fit each other, the model or the machine, EXTRAGS_ISA names an
+            instruction set that is not usable here, or a metric that a program registered does not work.
         ExtragsError: when the code a checkpoint needs does not start.
     """
     # Only where it is set: asking the kernels loads torch, which looking up a deployment must not.
@@ -39,6 +40,12 @@ def preflight(config: PipelineConfig, until: str, leave_out: Collection[str] = (
         from extrags.placement import check_device
 
         check_device(config)
+    if "evaluate" in wanted and added_metrics():
+        # Here, because it loads torch, which looking up a deployment must not.
+        from extrags.metrics.photometric import try_added_metrics
+        from extrags.placement import run_device
+
+        try_added_metrics(run_device(config))
     if "depth" in wanted and config.depth.enabled and "depth" not in leave_out:
         from extrags.devices import chosen_device
         from tasks.weights import depth_completion_digest, depth_monocular_digest

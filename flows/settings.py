@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -98,7 +99,20 @@ def check_runner(name: str) -> tuple[str, str]:
     if kind not in RUNNERS or (kind == "threads" and address):
         meant = did_you_mean(kind, RUNNERS) if kind not in RUNNERS else ""
         raise ConfigError(f"no task runner {name!r}; expected threads, dask or dask:ADDRESS{meant}")
+    if address and not _is_scheduler(address):
+        raise ConfigError(
+            f"no task runner {name!r}: {address} is no address of a Dask scheduler; expected HOST:PORT, or "
+            "that behind tcp://, tls://, ws:// or wss://, e.g. dask:tcp://127.0.0.1:8786"
+        )
     return kind, address
+
+
+def _is_scheduler(address: str) -> bool:
+    """Whether an address can be that of a scheduler in another process; nothing is connected to."""
+    match = re.fullmatch(
+        r"(?:(?:tcp|tls|ws|wss|ucx)://)?(?:[^\s:/\[\]]+|\[[0-9A-Fa-f:.%\w]+\]):([0-9]{1,5})", address
+    )
+    return match is not None and 0 < int(match[1]) <= 65_535
 
 
 def task_runner(name: str, at_once: int = 1) -> Any:

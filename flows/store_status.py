@@ -95,8 +95,9 @@ class StoreStatus:
         rows: by sequence.
         artefacts: how many there are, of these rows and of all others.
         bytes: of the artefacts of these rows, each counted once.
-        unrecorded: artefacts that neither a run on record nor one that is going on has: of runs with other
-            settings, of benchmarks, of versions that left no record.
+        unrecorded: artefacts of stages that neither a run on record nor one that is going on has: of runs
+            with other settings, of benchmarks, of versions that left no record. Pages of several sequences
+            are not among them.
     """
 
     store: str
@@ -207,7 +208,8 @@ def store_status(store: Store, patterns: Sequence[str] = ()) -> StoreStatus:
     counts: dict[State, int] = {}
     for row in rows:
         counts[row.state] = counts.get(row.state, 0) + 1
-    unrecorded = sum(key not in recorded for key in keys)
+    # Pages of several sequences are of no one run.
+    unrecorded = sum(key not in recorded and _stage_of(stage_of(key)) in STAGES for key in keys)
     return StoreStatus(store.root, rows, len(keys), sum(bytes_of.values()), unrecorded, counts)
 
 

@@ -6,15 +6,17 @@ this: a new setting only takes a field of a model, with its limits and its descr
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeGuard, Union, get_args, get_origin
 
-from pydantic import BaseModel, TypeAdapter, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic_core import PydanticKnownError
 
-from extrags.config.base import KeyOf
+from extrags.config.base import LARGEST_WHOLE_NUMBER, KeyOf, check_size, check_truth_value, has_largest
 from extrags.errors import ConfigError, did_you_mean
 
 __all__ = ["Setting", "groups_of", "settings_of", "unknown_setting"]
@@ -56,13 +58,27 @@ class Setting:
         if NoneType in self._kinds and text.strip().lower() in ("none", "null"):
             return None
         several = get_origin(self.annotation) is tuple
-        found = text.strip("[]() ").split(",") if several else text
+        return self._validated(text.strip("[]() ").split(",") if several else text, text)
+
+    def checked(self, value: Any) -> Any:
+        """The value of the setting that a value of JSON or YAML stands for; a text is parsed.
+
+        Raises:
+            ConfigError: names the setting, what was found and what was expected.
+        """
+        # A word, such as `none` or `1e-3`, means what it means after the setting's own flag.
+        return self.parse(value) if isinstance(value, str) else self._validated(value, self.text(value))
+
+    def _validated(self, value: Any, found: str) -> Any:
+        # The name, because `Annotated` wants at least one thing to hold; pydantic passes over it.
+        kind: Any = Annotated[self.annotation, self.name, *self.limits]
         try:
-            # The name, because `Annotated` wants at least one thing to hold; pydantic passes over it.
-            kind: Any = Annotated[self.annotation, self.name, *self.limits]
-            return TypeAdapter(kind).validate_python(found)
-        except ValidationError:
-            raise self.refused(text) from None
+            check_truth_value(value, self.annotation)
+            made = TypeAdapter(kind, config=ConfigDict(allow_inf_nan=False)).validate_python(value)
+            check_size(made, self.limits)
+        except (ValidationError, PydanticKnownError):
+            raise self.refused(found) from None
+        return made
 
     def text(self, value: Any) -> str:
         """Format a value as text; the inverse of `parse`."""
@@ -72,8 +88,15 @@ class Setting:
 
     def refused(self, found: str) -> ConfigError:
         """The error for an invalid value."""
-        meant = did_you_mean(found.strip("'"), self.choices)
-        return ConfigError(f"setting {self.name} is {found or 'empty'}; expected {self.expected}{meant}")
+        bare = found.strip("'")
+        meant = did_you_mean(bare, self.choices)
+        expected = self.expected
+        # What holds for all numbers is said where a value breaks it, not in each line of the help.
+        if _is_not_finite(bare):
+            expected = expected.replace("a number", "a finite number")
+        elif int in self._kinds and not has_largest(self.limits) and _is_too_large(bare):
+            expected = replace(self, limits=(*self.limits, *Field(le=LARGEST_WHOLE_NUMBER).metadata)).expected
+        return ConfigError(f"setting {self.name} is {found or 'empty'}; expected {expected}{meant}")
 
     @property
     def choices(self) -> list[str]:
@@ -150,6 +173,20 @@ def _models(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, typ
     for name, field in model.model_fields.items():
         if _is_model(field.annotation):
             yield from _models(field.annotation, f"{prefix}{name}.")
+
+
+def _is_not_finite(found: str) -> bool:
+    try:
+        return not math.isfinite(float(found))
+    except ValueError:
+        return False
+
+
+def _is_too_large(found: str) -> bool:
+    try:
+        return int(found) > LARGEST_WHOLE_NUMBER
+    except ValueError:
+        return False
 
 
 def _is_model(kind: Any) -> TypeGuard[type[BaseModel]]:

@@ -426,14 +426,19 @@ class PipelineConfig(StageConfig):
         """Apply `{"coarse.iterations": 500}`-like settings.
 
         Raises:
-            ConfigError: for an unknown name (with the nearest known one), a value out of range, or values
-                that do not go together.
+            ConfigError: for what is no mapping, an unknown name (with the nearest known one), a value out of
+                range, or values that do not go together.
         """
+        if not isinstance(overrides, Mapping):
+            raise ConfigError(
+                f"settings are {type(overrides).__name__}; expected a mapping, e.g. "
+                '{"coarse.iterations": 500}'
+            )
         known = settings_of(PipelineConfig)
         tree = self.model_dump()
         for name, value in overrides.items():
             if name not in known:
-                raise unknown_setting(name, known)
+                raise unknown_setting(str(name), known)
             *parents, leaf = name.split(".")
             node = tree
             for parent in parents:

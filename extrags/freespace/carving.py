@@ -99,7 +99,12 @@ def carve(
         less = distance - _nearest_error(corners, surface_error_mm, size)
         distance = np.where(distance > 0, np.maximum(less, 0.0), distance)
     space = FreeSpace(occupancy, origin_mm, axes, voxel_mm, distance.astype(np.float32))
-    _log.info("freespace: %.1f %% of %d^3 voxels of %.3g are free", 100 * space.free_share, size, voxel_mm)
+    _log.info(
+        "freespace: %.1f %% of %d^3 voxels, %.3g units of the poses wide, are free",
+        100 * space.free_share,
+        size,
+        voxel_mm,
+    )
     return space
 
 

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from extrags.array_shapes import check_instance
 from extrags.errors import ConfigError, MissingDependencyError, installed_with
 from extrags.radial_lens import RadialLens
 from extrags.raster.light import CameraLight
@@ -21,6 +22,7 @@ from extrags.raster.rendering import (
     RasterOptions,
     Rendering,
     check_finite,
+    check_values,
     checked_inputs,
 )
 
@@ -80,7 +82,7 @@ def rasterize(
         means: centres in world units.
         quats: rotations (w, x, y, z) of any length; a null quaternion counts as the identity.
         scales: standard deviations in world units (not their logarithms).
-        opacities: in (0, 1) (not logits).
+        opacities: in [0, 1] (not logits).
         sh: spherical harmonics coefficients, 1, 4, 9 or 16 per colour; the colour of a Gaussian is
             max(SH(direction) + 0.5, 0). None when `colors` is given.
         viewmats: camera from world, rigid.
@@ -106,7 +108,9 @@ def rasterize(
         The images and the optional outputs requested; see `Rendering` for shapes and meaning.
 
     Raises:
-        ShapeError: when shapes, dtypes or devices do not fit together, or a size is out of range.
+        ShapeError: when shapes, types or devices do not fit together, a size or an opacity is out of range,
+            or a focal length is not positive.
+        PoseError: when a view matrix is no rigid motion.
         NonFiniteError: when an input holds a NaN or an infinity; names the array and the entry.
         ConfigError: when the chosen backend cannot take these tensors, or a visibility mask is given where no
             visibility is asked for.
@@ -117,6 +121,13 @@ def rasterize(
     """
     if visibility_mask is not None and not visibility:
         raise ConfigError("a visibility_mask is given, but no visibility is asked for")
+    for name, value, kind in (
+        ("means", means, Tensor),
+        ("light", light, CameraLight),
+        ("visibility_mask", visibility_mask, Tensor),
+    ):
+        if value is not None:
+            check_instance(value, name, kind)
     packed = None if light is None else light.packed()
     counted = None if visibility_mask is None else visibility_mask.to(means.device, means.dtype)
     inputs = RasterInputs(
@@ -128,6 +139,7 @@ def rasterize(
     if chosen == "native":
         return rasterize_native(inputs, options)
     check_finite(inputs)
+    check_values(inputs)
     if chosen == "gsplat":
         from extrags.raster.gsplat import rasterize_gsplat
 

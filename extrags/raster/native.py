@@ -17,7 +17,7 @@ from torch import Tensor
 from extrags.cores import usable_cores
 from extrags.errors import ConfigError, MissingDependencyError, ShapeError
 from extrags.raster.light import ROW_LENGTH
-from extrags.raster.rendering import RasterInputs, RasterOptions, Rendering, nonfinite_error
+from extrags.raster.rendering import RasterInputs, RasterOptions, Rendering, check_values, nonfinite_error
 
 _kernels: ModuleType | None = None
 _import_error: ImportError | None = None
@@ -146,6 +146,7 @@ def rendered_frame(gaussians: Any, camera: Any, images: Any, *, degree: int, che
 def rasterize_native(inputs: RasterInputs, options: RasterOptions) -> Rendering:
     """Render float32 CPU tensors with the native kernels; arguments as checked by `rasterize`."""
     _check_finite(inputs)
+    check_values(inputs)
     call = _Call.prepared(inputs, options)
     rgb, alpha, depth = _Rasterize.apply(  # type: ignore[no-untyped-call]
         call,

@@ -5,11 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from extrags.errors import NonFiniteError, ShapeError
+from extrags.array_shapes import check_whole
+from extrags.cameras import ROTATION_TOLERANCE
+from extrags.errors import NonFiniteError, PoseError, ShapeError
 from extrags.radial_lens import RadialLens
 from extrags.raster.light import ROW_LENGTH
 
@@ -36,6 +39,11 @@ FIELD_OF_VIEW_MARGIN = 0.3
 
 ALPHA_EPS = 1e-10
 """Lower bound of the denominator of the expected depth."""
+
+_LAST_ROW_TOLERANCE = 1e-4
+"""Of a view matrix; differences of gradients by finite steps are smaller."""
+_OPTIONAL = ("sh", "colors", "background", "query_points", "light", "visibility_mask")
+"""Of `RasterInputs`."""
 
 
 @dataclass(frozen=True)
@@ -129,6 +137,18 @@ def checked_inputs(
     Raises:
         ShapeError: when shapes, dtypes or devices do not fit together, or a size is out of range.
     """
+    for name, value in vars(inputs).items():
+        if value is None and name in (
+            "sh",
+            "colors",
+            "background",
+            "query_points",
+            "light",
+            "visibility_mask",
+        ):
+            continue
+        if not isinstance(value, Tensor):
+            raise ShapeError(f"{name} is {type(value).__name__}, expected a torch tensor")
     means = inputs.means
     if means.ndim != 2 or means.shape[1] != 3:
         raise ShapeError(f"means has shape {tuple(means.shape)}, expected (N, 3)")
@@ -178,6 +198,8 @@ def check_size(width: int, height: int) -> None:
     Raises:
         ShapeError: when it is out of range.
     """
+    check_whole("width", width)
+    check_whole("height", height)
     if not (1 <= width <= 32768 and 1 <= height <= 32768):
         raise ShapeError(f"image size {width}x{height}, expected 1 to 32768 pixels a side")
 
@@ -204,6 +226,48 @@ def check_finite(inputs: RasterInputs) -> None:
         finite = torch.isfinite(value.detach())
         if not bool(finite.all()):
             raise nonfinite_error(name, value)
+
+
+def check_values(inputs: RasterInputs) -> None:
+    """Check that finite arguments mean something: they would render, and mislead.
+
+    Raises:
+        ShapeError: for opacities outside [0, 1], as logits are, and focal lengths that are not positive.
+        PoseError: for view matrices that are no rigid motions.
+    """
+    if inputs.opacities.numel():
+        low, high = (float(value) for value in torch.aminmax(inputs.opacities.detach()))
+        if low < 0 or high > 1:
+            raise ShapeError(f"opacities are from {low:g} to {high:g}, expected [0, 1], as no logits are")
+    # As plain numbers: for the few of a camera, calls on arrays take many times as long.
+    matrices = [value.detach().cpu().numpy().tolist() for value in (inputs.Ks, inputs.viewmats)]
+    for camera, (K, view) in enumerate(zip(*matrices, strict=True)):
+        fx, fy = K[0][0], K[1][1]
+        if not (fx > 0 and fy > 0):
+            raise ShapeError(
+                f"Ks[{camera}] has the focal lengths {fx:g} and {fy:g} px, expected positive numbers"
+            )
+        (a, b, c, _), (d, e, f, _), (g, h, i, _), last = view
+        # With rows of unit length, the volume they span is 1 only where they are at right angles as well.
+        volume = a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g)
+        lengths = (a * a + b * b + c * c, d * d + e * e + f * f, g * g + h * h + i * i)
+        off = max(abs(volume - 1), *(abs(length - 1) for length in lengths))
+        last_off = max(abs(entry - value) for entry, value in zip(last, (0, 0, 0, 1), strict=True))
+        if off > 3 * ROTATION_TOLERANCE or last_off > _LAST_ROW_TOLERANCE:
+            raise _view_error(np.array(view), camera)
+
+
+def _view_error(view: Float[np.ndarray, "4 4"], camera: int) -> PoseError:
+    if np.abs(view[3] - (0, 0, 0, 1)).max() > _LAST_ROW_TOLERANCE:
+        problem = f"the last row is {np.round(view[3], 4).tolist()}, expected [0, 0, 0, 1]"
+    else:
+        lengths = np.round(np.linalg.svd(view[:3, :3], compute_uv=False), 4).tolist()
+        determinant = float(np.linalg.det(view[:3, :3]))
+        problem = (
+            f"no rigid motion: singular values {lengths} and determinant {determinant:.3f}, expected 1, 1, 1 "
+            "and +1; is it scaled or mirrored?"
+        )
+    return PoseError(problem, field=f"viewmats[{camera}]")
 
 
 def nonfinite_error(name: str, value: Tensor) -> NonFiniteError:

@@ -6,11 +6,13 @@ Nothing heavy is imported here: the settings are loaded for the verbs that have 
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import shlex
 import shutil
 import textwrap
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -34,6 +36,8 @@ __all__ = [
     "add_stages",
     "add_store",
     "add_verb",
+    "number_above_zero",
+    "whole_number",
 ]
 
 DEFAULT_PROFILE = "balanced"
@@ -185,6 +189,26 @@ def add_json(parser: Parser) -> None:
     )
 
 
+def whole_number(least: int, most: int) -> Callable[[str], int]:
+    """A parser of whole numbers in a range, as argparse takes one for `type`."""
+
+    def parsed(text: str) -> int:
+        with suppress(ValueError):
+            if least <= int(text) <= most:
+                return int(text)
+        raise argparse.ArgumentTypeError(f"{text}; expected a whole number from {least} to {most}")
+
+    return parsed
+
+
+def number_above_zero(text: str) -> float:
+    """A finite number above 0; `type` of an option."""
+    with suppress(ValueError):
+        if 0 < float(text) < math.inf:
+            return float(text)
+    raise argparse.ArgumentTypeError(f"{text}; expected a finite number above 0")
+
+
 def _runner(name: str) -> str:
     """A task runner by name: what is wrong with it is said before anything is planned."""
     from flows.settings import check_runner
@@ -207,7 +231,7 @@ def add_runner(parser: Parser) -> None:
     )
     parser.add_argument(
         "--retries",
-        type=int,
+        type=whole_number(0, 10),
         default=2,
         metavar="N",
         help="further tries of a stage after an error that can pass: store, network, lost worker, I/O "
@@ -215,7 +239,7 @@ def add_runner(parser: Parser) -> None:
     )
     parser.add_argument(
         "--stage-time-limit",
-        type=float,
+        type=number_above_zero,
         metavar="SECONDS",
         help="a stage that takes longer fails at its next progress event (default: no limit)",
     )

@@ -25,7 +25,15 @@ from flows.commands.common import (
     store_root,
     write_json,
 )
-from flows.commands.options import Parser, add_json, add_method, add_runner, add_sequences, add_stages
+from flows.commands.options import (
+    Parser,
+    add_json,
+    add_method,
+    add_runner,
+    add_sequences,
+    add_stages,
+    number_above_zero,
+)
 from flows.commands.run_checks import check_methods, check_names, check_working_distance, wrong_source
 from flows.failures import describe_error
 from flows.outcome import DatasetFailedError, DatasetOutcome, SequenceOutcome
@@ -61,7 +69,7 @@ def add_arguments(parser: Parser) -> None:
     )
     parser.add_argument(
         "--memory-limit",
-        type=float,
+        type=number_above_zero,
         metavar="GB",
         help="refuse a sequence whose estimated peak memory is higher, and name settings that fit; of each "
         "sequence in work (default: no limit)",

@@ -5,12 +5,9 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin
+from typing import Any
 
 from extrags.errors import ConfigError
-
-if TYPE_CHECKING:
-    from extrags.config.settings import Setting
 
 __all__ = ["settings_of_file"]
 
@@ -43,33 +40,11 @@ def settings_of_file(file: Path) -> dict[str, Any]:
         try:
             if name not in known:
                 raise unknown_setting(name, known)
-            found[name] = _checked(known[name], value)
+            found[name] = known[name].checked(value)
         except ConfigError as error:
             option = f"; --{name} is an option of the command line" if name in _OPTIONS else ""
             raise ConfigError(f"--config {file}: {error}{option}") from error
     return found
-
-
-def _checked(setting: Setting, value: Any) -> Any:
-    """The value of a setting, if it may have it; a text is parsed."""
-    from pydantic import TypeAdapter, ValidationError
-
-    if isinstance(value, str):
-        # A word, such as `none` or `1e-3`, means what it means after the setting's own flag.
-        return setting.parse(value)
-    several = get_origin(setting.annotation) is tuple and isinstance(value, list)
-    # pydantic takes `true` for 1.
-    if bool not in (setting.annotation, *get_args(setting.annotation)) and any(
-        isinstance(part, bool) for part in (value if several else [value])
-    ):
-        raise setting.refused(setting.text(value))
-    try:
-        # The name, because `Annotated` wants at least one thing to hold; pydantic passes over it.
-        kind: Any = Annotated[setting.annotation, setting.name, *setting.limits]
-        TypeAdapter(kind).validate_python(value)
-    except ValidationError:
-        raise setting.refused(setting.text(value)) from None
-    return value
 
 
 def _content(file: Path) -> Mapping[Any, Any]:

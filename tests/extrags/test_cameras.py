@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import re
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -57,6 +60,24 @@ class TestCameras:
         batch = cameras()
         product = batch.viewmats @ batch.world_from_camera
         np.testing.assert_allclose(product, np.tile(np.eye(4), (3, 1, 1)), atol=1e-12)
+
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            ({"width": 0}, "Cameras of 0 x 48 px, expected at least 1 x 1"),
+            ({"height": -3}, "Cameras of 64 x -3 px"),
+            ({"width": 10.5}, "width is 10.5, expected a whole number of pixels"),
+            ({"height": "48"}, "height is '48', expected a whole number of pixels"),
+            ({"K": [[1.0]]}, "Cameras: K is list, expected ndarray"),
+            ({"world_from_camera": None}, "Cameras: world_from_camera is NoneType, expected ndarray"),
+        ],
+    )
+    @pytest.mark.usefixtures("unchecked")
+    def test_what_is_no_camera(self, change: dict[str, Any], message: str) -> None:
+        given = {"K": np.eye(3)[None], "world_from_camera": np.eye(4)[None], "width": 64, "height": 48}
+        assert len(Cameras(**{**given, "width": np.int64(64)})) == 1
+        with pytest.raises(ShapeError, match=re.escape(message)):
+            Cameras(**{**given, **change})
 
     def test_indexing_keeps_the_batch_axis(self) -> None:
         batch = cameras()

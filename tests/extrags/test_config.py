@@ -9,9 +9,10 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
-from pydantic import BaseModel, ValidationError
+from pydantic import AllowInfNan, BaseModel, Field, ValidationError
 
 from extrags.config import PROFILES, PipelineConfig, profile_config
+from extrags.config.base import LARGEST_WHOLE_NUMBER, has_largest
 from extrags.config.settings import Setting, groups_of, settings_of
 from extrags.errors import ConfigError
 
@@ -69,6 +70,14 @@ class TestConfig:
             PipelineConfig().with_overrides({path: 1})
 
     @pytest.mark.parametrize(
+        ("overrides", "message"),
+        [(["coarse.iterations"], "settings are list; expected a mapping"), ({3: 1}, "no setting 3;")],
+    )
+    def test_what_is_no_mapping_of_settings(self, overrides: Any, message: str) -> None:
+        with pytest.raises(ConfigError, match=message):
+            PipelineConfig().with_overrides(overrides)
+
+    @pytest.mark.parametrize(
         ("name", "value", "expected"),
         [
             ("coarse.iterations", -7, "is -7; expected a whole number of at least 1"),
@@ -76,6 +85,13 @@ class TestConfig:
             ("ingest.width", 5, "is 5; expected a whole number from 16 to 4096 or none"),
             ("coarse.refine_poses", "often", "is 'often'; expected true, false or auto"),
             ("enhance.channels", [8, "x", 8], "expected 3 whole numbers with commas between"),
+            ("enhance.channels", [8, True, 8], "expected 3 whole numbers with commas between"),
+            ("enhance.channels", [8, 10**30, 8], "expected 3 whole numbers with commas between"),
+            ("coarse.iterations", 2**31, "is 2147483648; expected a whole number from 1 to 2147483647"),
+            ("coarse.iterations", True, "is True; expected a whole number of at least 1"),
+            ("coarse.light.exponent", math.inf, "is inf; expected a finite number above 0"),
+            ("coarse.light.exponent", "-inf", "is '-inf'; expected a finite number above 0"),
+            ("ingest.end_s", math.nan, "is nan; expected a finite number above 0 or none"),
         ],
     )
     def test_a_wrong_value_is_one_sentence_with_the_range(
@@ -110,7 +126,13 @@ def values(setting: Setting) -> st.SearchStrategy[Any]:
         return st.sampled_from(setting.choices)
     union = get_origin(setting.annotation) in (Union, UnionType)
     kinds: tuple[Any, ...] = get_args(setting.annotation) if union else (setting.annotation,)
-    limited = (Annotated[kind, setting.name, *setting.limits] for kind in kinds if kind in (int, float, str))
+    largest = () if has_largest(setting.limits) else Field(le=LARGEST_WHOLE_NUMBER).metadata
+    by_kind = {
+        int: (*setting.limits, *largest),
+        float: (*setting.limits, AllowInfNan(False)),
+        str: setting.limits,
+    }
+    limited = (Annotated[kind, setting.name, *by_kind[kind]] for kind in kinds if kind in by_kind)
     free = (kind for kind in kinds if kind not in (int, float, str))
     return st.one_of(*(st.from_type(kind) for kind in (*limited, *free)))
 
@@ -133,6 +155,20 @@ class TestSettings:
             assert setting.description, name
             assert setting.expected, name
             assert groups[setting.group], name
+
+    @pytest.mark.parametrize(
+        ("kind", "value"),
+        [(float, math.inf), (float, math.nan), (float, True), (int, 10**30), (int, True)],
+    )
+    def test_no_number_is_without_end_or_a_truth_value(self, kind: type, value: float) -> None:
+        kinds = {name: (item.annotation, *get_args(item.annotation)) for name, item in SETTINGS.items()}
+        numbers = [name for name in SETTINGS if kind in kinds[name] and bool not in kinds[name]]
+        assert len(numbers) > 60
+        for name in numbers:
+            with pytest.raises(ConfigError, match=re.escape(f"setting {name} is ")):
+                SETTINGS[name].checked(value)
+            with pytest.raises(ConfigError, match=re.escape(f"setting {name} is ")):
+                PipelineConfig().with_overrides({name: value})
 
     @given(st.data())
     @hypothesis_settings(deadline=None)

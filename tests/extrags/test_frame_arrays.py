@@ -8,15 +8,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 import extrags
 from extrags.cameras import Cameras, look_at
 from extrags.errors import ConfigError, ExtragsError, PoseError, ShapeError, SourceError
 from extrags.gaussians import Gaussians
 from extrags.in_memory_pipeline import InMemoryPipeline
+from extrags.metrics.image import ssim
 from extrags.metrics.protocol import RenderedViews
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence, Split
+from extrags.sequence_checks import SMALLEST_SIDE_PX
 
 FRAMES, HEIGHT, WIDTH = 10, 12, 16
 K = np.array([[14.0, 0, 8], [0, 14.0, 6], [0, 0, 1]])
@@ -37,6 +40,16 @@ def changed(array: np.ndarray, index: Any, value: Any) -> np.ndarray:
     other = array.copy()
     other[index] = value
     return other
+
+
+def test_the_smallest_frames_are_those_that_can_be_evaluated() -> None:
+    side = SMALLEST_SIDE_PX
+    assert ssim(torch.zeros(side, side, 3), torch.zeros(side, side, 3)) == pytest.approx(1)
+    too_small = np.zeros((FRAMES, side, side - 1, 3), np.uint8)
+    with pytest.raises(SourceError, match="field rgb: frames of 5 x 6 px; expected at least 6 px a side"):
+        extrags.sequence_from_arrays(too_small, K)
+    with pytest.raises(ShapeError, match="SSIM needs images larger"):
+        ssim(torch.zeros(side, side - 1, 3), torch.zeros(side, side - 1, 3))
 
 
 class TestFromArrays:
@@ -105,6 +118,16 @@ class TestFromArrays:
     @pytest.mark.parametrize(
         ("field", "value", "kind", "message"),
         [
+            ("metric", "no", ConfigError, "arrays: metric is 'no', expected True or False"),
+            ("metric", 1, ConfigError, "metric is 1, expected True or False"),
+            ("name", None, ConfigError, "name is None, expected a text"),
+            ("name", 3, ConfigError, "name is 3, expected a text"),
+            (
+                "frame_names",
+                ["a"] * 2 + [f"b{k}" for k in range(8)],
+                SourceError,
+                "two frames are called 'a'",
+            ),
             ("rgb", np.zeros((4, 12, 16), np.uint8), ShapeError, r"rgb is uint8 \(4, 12, 16\)"),
             ("rgb", np.zeros((4, 12, 16, 4), np.uint8), ShapeError, "expected uint8 or float"),
             ("rgb", np.zeros((0, 12, 16, 3), np.uint8), ShapeError, "rgb is"),

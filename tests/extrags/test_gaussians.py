@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from plyfile import PlyData
 
-from extrags.errors import CaptureError, ShapeError, SourceError, SourceNotFoundError
+from extrags.errors import CaptureError, NonFiniteError, ShapeError, SourceError, SourceNotFoundError
 from extrags.gaussians import SH_C0, Gaussians
 
 
@@ -96,6 +96,17 @@ class TestGaussians:
     def test_a_ply_without_gaussians_is_refused(self, tmp_path: Path) -> None:
         with pytest.raises(CaptureError, match=r"no Gaussians to write into .*a\.ply"):
             random_gaussians(0, 1).write_ply(tmp_path / "a.ply")
+        assert not (tmp_path / "a.ply").exists()
+
+    @pytest.mark.parametrize("value", [float("nan"), float("-inf")])
+    @pytest.mark.parametrize("name", ["means", "opacities", "shN"])
+    def test_numbers_that_readers_refuse_are_not_written(
+        self, name: str, value: float, tmp_path: Path
+    ) -> None:
+        gaussians = random_gaussians(5, 1)
+        gaussians.parameters()[name][2:4] = value
+        with pytest.raises(NonFiniteError, match=rf"{name} of 2 of 5 Gaussians hold NaN .*a\.ply is not"):
+            gaussians.write_ply(tmp_path / "a.ply")
         assert not (tmp_path / "a.ply").exists()
 
     def test_ply_of_gaussians_elsewhere(self, tmp_path: Path, elsewhere: torch.device) -> None:

@@ -34,7 +34,7 @@ SET = {
     "coarse.densify.max_gaussians": 900,
     "device": "cpu",
     "ingest.width": None,
-    "evaluate.lpips_nets": ["alex", "vgg"],
+    "evaluate.lpips_nets": ("alex", "vgg"),
 }
 
 

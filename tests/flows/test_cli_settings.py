@@ -73,6 +73,12 @@ class TestRunners:
         [
             ("dsk", "no task runner 'dsk'; expected threads, dask or dask:ADDRESS; did you mean dask?"),
             ("threads:4", "no task runner 'threads:4'; expected threads, dask or dask:ADDRESS (see"),
+            ("dask:nonsense", "nonsense is no address of a Dask scheduler; expected HOST:PORT, or"),
+            ("dask:tcp://127.0.0.1", "tcp://127.0.0.1 is no address of a Dask scheduler"),
+            ("dask:tcp://:8786", "tcp://:8786 is no address of a Dask scheduler"),
+            ("dask:tpc://127.0.0.1:8786", "tpc://127.0.0.1:8786 is no address of a Dask scheduler"),
+            ("dask:node-1:99999", "node-1:99999 is no address of a Dask scheduler"),
+            ("dask:::1:8786", "::1:8786 is no address of a Dask scheduler"),
         ],
     )
     def test_an_unknown_one_is_refused_by_the_parser(self, verb: str, name: str, message: str) -> None:
@@ -80,6 +86,45 @@ class TestRunners:
             parser(verb).parse_args([verb, SEQUENCE, "--runner", name])
         assert message in str(caught.value)
 
-    @pytest.mark.parametrize("name", ["threads", "dask", "dask:tcp://127.0.0.1:8786"])
+    @pytest.mark.parametrize(
+        "name",
+        [
+            *("threads", "dask", "dask:tcp://127.0.0.1:8786", "dask:node-1.cluster:8786"),
+            *("dask:tls://[::1]:8786", "dask:[fe80::1%eth0]:8786"),
+        ],
+    )
     def test_known_ones(self, name: str) -> None:
         assert parser("run").parse_args(["run", SEQUENCE, "--runner", name]).runner == name
+
+
+class TestLimits:
+    """Limits are looked at by the parser: what is in the store already needs no flow that would."""
+
+    @pytest.mark.parametrize("verb", ["run", "plan", "benchmark"])
+    @pytest.mark.parametrize(
+        ("option", "value", "expected"),
+        [
+            ("--retries", "-1", "a whole number from 0 to 10"),
+            ("--retries", "11", "a whole number from 0 to 10"),
+            ("--retries", "few", "a whole number from 0 to 10"),
+            ("--stage-time-limit", "0", "a finite number above 0"),
+            ("--stage-time-limit", "nan", "a finite number above 0"),
+            ("--stage-time-limit", "inf", "a finite number above 0"),
+        ],
+    )
+    def test_out_of_range(self, verb: str, option: str, value: str, expected: str) -> None:
+        with pytest.raises(ConfigError) as caught:
+            parser(verb).parse_args([verb, SEQUENCE, option, value])
+        assert f"argument {option}: {value}; expected {expected} (see" in str(caught.value)
+
+    @pytest.mark.parametrize("value", ["-1", "0", "much"])
+    def test_memory_out_of_range(self, value: str) -> None:
+        with pytest.raises(ConfigError) as caught:
+            parser("run").parse_args(["run", SEQUENCE, "--memory-limit", value])
+        assert f"argument --memory-limit: {value}; expected a finite number above 0" in str(caught.value)
+
+    def test_in_range(self) -> None:
+        given = parser("run").parse_args(
+            ["run", SEQUENCE, "--retries", "0", "--stage-time-limit", "0.5", "--memory-limit", "6"]
+        )
+        assert (given.retries, given.stage_time_limit, given.memory_limit) == (0, 0.5, 6.0)

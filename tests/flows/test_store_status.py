@@ -49,6 +49,15 @@ def test_a_finished_sequence(store: Store, finished: tuple[str, SequenceOutcome]
     assert found.artefacts == len(store.ls())
 
 
+def test_pages_of_several_sequences_are_of_no_run(store: Store) -> None:
+    for key in ("dataset-report-v7-x", "coarse-v1-x"):
+        with store.slot(stage=key.rpartition("-v")[0], version=7, key=key, label="a dataset") as slot:
+            (slot.path / "page.html").write_text("a page")
+    found = store_status(store)
+    # The scene is of a run with other settings.
+    assert (found.artefacts, found.unrecorded) == (len(store.ls()), 1)
+
+
 def test_what_was_removed_is_missing(store: Store) -> None:
     store.rm("finetune*")
     (row,) = store_status(store).rows

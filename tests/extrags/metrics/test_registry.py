@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -15,12 +16,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from extrags.config import LpipsNet
+from extrags.config import LpipsNet, PipelineConfig
 from extrags.errors import ConfigError, NonFiniteError, ShapeError
+from extrags.in_memory_pipeline import InMemoryPipeline
 from extrags.metrics import protocol
 from extrags.metrics.comparison import compare_runs, figure_of
 from extrags.metrics.image import means_in_regions
-from extrags.metrics.photometric import photometric_values
+from extrags.metrics.photometric import photometric_values, try_added_metrics
 from extrags.metrics.protocol import EvaluationResult, RenderedViews, evaluate_views
 from extrags.metrics.registry import (
     Metric,
@@ -36,6 +38,7 @@ from extrags.report.benchmark import BenchmarkInputs, build_benchmark_report
 from extrags.report.dataset import DatasetRow, build_dataset_report
 from extrags.sequence import EndoscopicSequence, Split
 from flows.outcome import SequenceOutcome
+from flows.preflight import preflight
 from flows.tables import benchmark_markdown, sequence_markdown
 
 TEST = np.array([1, 3])
@@ -53,6 +56,23 @@ TOY = Metric(
     measure=means_in_regions(absolute_error),
     description="What the toy says of itself.",
 )
+
+
+WRONG = [
+    ({"all": [float("nan")] * 2}, NonFiniteError, "all: a value is NaN or infinite"),
+    ({"all": [0.1]}, ShapeError, "all: 1 values for 2 images"),
+    ({"all": ["0.1", "0.2"]}, ShapeError, "all holds '0.1', str; expected numbers or None"),
+    ({"all": "ab"}, ShapeError, "all is str; expected a list of one number, or None, per image"),
+    ({"all": 0.1}, ShapeError, "all is float; expected a list of one number, or None, per image"),
+    ({"all": torch.zeros(2, 2)}, ShapeError, "all holds [0.0, 0.0], list; expected numbers or None"),
+    (
+        {"valid": [0.1] * 2},
+        ShapeError,
+        "measure gives no values of all, found valid; expected for each region",
+    ),
+    ({}, ShapeError, "measure gives no values of all, found none; expected for each region"),
+    (None, ShapeError, "measure gives NoneType; expected a dict, for each region one number per image"),
+]
 
 
 @pytest.fixture
@@ -189,15 +209,40 @@ class TestOwnMetric:
         assert result.metrics["toy_error"] is None
         assert result.reasons["toy_error"] == "no view has a value"
 
-    @pytest.mark.parametrize(
-        ("values", "error"),
-        [([float("nan")] * 2, NonFiniteError), ([0.1], ShapeError)],
-    )
-    def test_what_no_result_may_hold_is_refused(self, values: list[float], error: type[Exception]) -> None:
-        metric = replace(TOY, measure=lambda *_: {"all": values})
+    @pytest.mark.parametrize(("given", "error", "said"), WRONG)
+    def test_what_no_result_may_hold_is_refused(
+        self, given: object, error: type[Exception], said: str, unchecked: None
+    ) -> None:
+        metric = replace(TOY, measure=lambda *_: given)
         images, everything = torch.zeros(2, 8, 8, 3), torch.ones(2, 8, 8, dtype=torch.bool)
-        with pytest.raises(error, match="metric toy_error"):
+        with pytest.raises(error, match=re.escape(f"metric toy_error: {said}")):
             photometric_values(images, images, {"all": everything}, [metric], None)
+
+    @pytest.mark.parametrize("given", [[1, None], (0.25, np.float32(0.5)), torch.tensor([0.25, 0.5])])
+    def test_values_are_plain_numbers(self, given: Any, unchecked: None) -> None:
+        metric = replace(TOY, measure=lambda *_: {"all": given})
+        images, everything = torch.zeros(2, 8, 8, 3), torch.ones(2, 8, 8, dtype=torch.bool)
+        found = photometric_values(images, images, {"all": everything}, [metric], None)["all"]["toy_error"]
+        assert found == [1.0, None] if isinstance(given, list) else found == [0.25, 0.5]
+        assert {type(value) for value in found} <= {float, type(None)}
+
+    def test_is_tried_before_a_run(self, sequence: EndoscopicSequence, toy: Metric, unchecked: None) -> None:
+        try_added_metrics()
+        for measure, said in (
+            (lambda *_: {}, "metric toy_error: measure gives no values of valid, observed, unobserved"),
+            (lambda *_: 1 / 0, "ZeroDivisionError: division by zero"),
+        ):
+            unregister_metric("toy_error")
+            register_metric(replace(TOY, measure=measure))
+            pattern = "metric toy_error fails on two made-up pairs .*: " + re.escape(said)
+            for attempt in (
+                try_added_metrics,
+                lambda: preflight(PipelineConfig(), "report"),
+                lambda: InMemoryPipeline(sequence, PipelineConfig()).ingest(),
+            ):
+                with pytest.raises(ConfigError, match=pattern):
+                    attempt()
+            preflight(PipelineConfig(), "coarse")
 
     @pytest.mark.parametrize(
         ("change", "message"),

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import re
 import threading
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
-from extrags.errors import ConfigError, MissingDependencyError, NonFiniteError, ShapeError
+from extrags.errors import ConfigError, MissingDependencyError, NonFiniteError, PoseError, ShapeError
 from extrags.raster import Rendering, available_backends, native, rasterize, set_num_threads
 from tests.extrags.raster.scenes import RasterScene, relative_l2, same_transmittance, tube, weighted_sum
 
@@ -336,6 +339,47 @@ class TestErrors:
             RasterScene(**{**vars(scene), "colors": torch.ones(10, 3)}).render("native")
         with pytest.raises(ShapeError, match="query_points"):
             scene.render("native", query_points=torch.ones(3))
+
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            ({"means": np.zeros((10, 3), np.float32)}, "means is ndarray, expected Tensor"),
+            ({"quats": np.zeros((10, 4), np.float32)}, "quats is ndarray, expected a torch tensor"),
+            ({"viewmats": None}, "viewmats is NoneType, expected a torch tensor"),
+            ({"background": [0.0, 0.0, 0.0]}, "background is list, expected a torch tensor"),
+            ({"width": 32.0}, "width is 32.0, expected a whole number of pixels"),
+            ({"height": "32"}, "height is '32', expected a whole number of pixels"),
+        ],
+    )
+    def test_types_by_name(self, change: dict[str, Any], message: str, unchecked: None) -> None:
+        with pytest.raises(ShapeError, match=re.escape(message)):
+            RasterScene(**{**vars(tube(10, 8, 8)), **change}).render("native")
+
+    @pytest.mark.parametrize("backend", ["native", "reference"])
+    @pytest.mark.parametrize(
+        ("change", "error", "message"),
+        [
+            ({"opacities": torch.full((10,), 1.5)}, ShapeError, "opacities are from 1.5 to 1.5"),
+            ({"opacities": torch.full((10,), -0.5)}, ShapeError, "opacities are from -0.5 to -0.5"),
+            ({"Ks": torch.zeros(1, 3, 3)}, ShapeError, "Ks[0] has the focal lengths 0 and 0 px"),
+            ({"viewmats": torch.diag(torch.tensor([-1.0, 1, 1, 1]))[None]}, PoseError, "determinant -1.000"),
+            (
+                {"viewmats": torch.diag(torch.tensor([2.0, 2, 2, 1]))[None]},
+                PoseError,
+                "values [2.0, 2.0, 2.0]",
+            ),
+            ({"viewmats": torch.ones(1, 4, 4)}, PoseError, "the last row is [1.0, 1.0, 1.0, 1.0]"),
+        ],
+    )
+    def test_values_that_mislead(
+        self, change: dict[str, Any], error: type[Exception], message: str, backend: str
+    ) -> None:
+        with pytest.raises(error, match=re.escape(message)):
+            RasterScene(**{**vars(tube(10, 8, 8)), **change}).render(backend)
+
+    def test_opacities_may_be_rounded_to_their_limits(self) -> None:
+        scene = tube(10, 8, 8)
+        RasterScene(**{**vars(scene), "opacities": torch.linspace(0, 1, 10)}).render("native")
 
     @pytest.mark.parametrize("backend", ["native", "reference"])
     @pytest.mark.parametrize("value", [float("nan"), float("inf"), float("-inf")])
