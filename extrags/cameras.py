@@ -79,6 +79,19 @@ class Cameras:
     def __len__(self) -> int:
         return int(self.world_from_camera.shape[0])
 
+    def check_finite(self) -> None:
+        """Refuse poses or intrinsics that hold NaN or infinity.
+
+        Raises:
+            PoseError: names the first such view by its position.
+        """
+        for name in ("world_from_camera", "K"):
+            finite = np.isfinite(getattr(self, name)).all(axis=(1, 2))
+            if not finite.all():
+                raise PoseError(
+                    f"view {int(np.flatnonzero(~finite)[0])} of {len(self)} holds NaN or infinity", field=name
+                )
+
     def __repr__(self) -> str:
         lens = "pinholes" if self.lens is None else "radial lens"
         return f"Cameras({len(self)} views of {self.width} x {self.height} px, {lens})"

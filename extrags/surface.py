@@ -153,7 +153,9 @@ def fuse_depth(cameras: Cameras, depth_mm: Float[np.ndarray, "c h w"], config: S
     Raises:
         ShapeError: when depth maps and cameras do not fit each other, or the cameras have a lens.
         CaptureError: when there is no valid depth or no surface comes out of it.
+        PoseError: for poses or intrinsics that are not finite.
     """
+    cameras.check_finite()
     if cameras.lens is not None:
         raise ShapeError("depth is fused from pinholes; take `Cameras.as_pinholes`")
     if depth_mm.shape != (len(cameras), cameras.height, cameras.width):

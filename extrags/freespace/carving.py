@@ -62,12 +62,14 @@ def carve(
 
     Raises:
         CaptureError: when no voxel is free, or there is no view to carve from.
+        PoseError: for poses or intrinsics that are not finite.
 
     Source: [ExtraGS, section "Scene Initialization and Feasible Region Estimation"], see docs/references.md.
     """
     config = PROFILES[DEFAULT_PROFILE].freespace if config is None else config
     if not len(cameras):
         raise CaptureError("no views to carve free space from")
+    cameras.check_finite()
     # Transmittance at points comes from the native kernels, and the grid is on the processor.
     scene = scene.to("cpu")
     size = config.grid_size

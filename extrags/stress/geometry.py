@@ -15,13 +15,11 @@ from extrags.cameras import Cameras, compose, invert_poses
 from extrags.config import FreespaceConfig, SurfaceConfig
 from extrags.freespace.carving import carve
 from extrags.freespace.grid import FreeSpace
-from extrags.gaussians import Gaussians
-from extrags.illumination import NearFieldLight
 from extrags.lens import LENS_PARAMETERS, Lens, Undistortion, sample_depth
 from extrags.metrics.pose import absolute_trajectory_error, relative_pose_error, umeyama
 from extrags.poses.scale import depth_scale
 from extrags.scene import Scene
-from extrags.stress.inputs import FARTHEST_OFFSET_MM, SCALES, plane_views
+from extrags.stress.inputs import FARTHEST_OFFSET_MM, SCALES, TURN, UPRIGHT, plane_views
 from extrags.stress.rows import (
     EPS,
     EXACT,
@@ -34,6 +32,7 @@ from extrags.stress.rows import (
     only_refused,
     with_threads,
 )
+from extrags.stress.tube import tube
 from extrags.surface import Mesh, fuse_depth
 
 __all__ = ["ROWS"]
@@ -42,9 +41,9 @@ SURFACE = SurfaceConfig(min_cluster_triangles=1)
 CARVING = FreespaceConfig(grid_size=24, render_width=48)
 
 
-def _off_plane(unit: float, offset_mm: float) -> float:
+def _off_plane(unit: float, offset_mm: float, turn: np.ndarray = UPRIGHT) -> float:
     """Largest distance of the mesh from the plane that was seen, in half pixels and voxels."""
-    cameras, depth, normal, point = plane_views(4, 48, 40, unit=unit, offset_mm=offset_mm)
+    cameras, depth, normal, point = plane_views(4, 48, 40, unit=unit, offset_mm=offset_mm, turn=turn)
     mesh = fuse_depth(cameras, depth, SURFACE)
     distance = np.abs((mesh.vertices.astype(np.float64) - point) @ normal)
     voxel = float(np.quantile(depth, 0.95)) * SURFACE.voxel_share
@@ -63,6 +62,8 @@ def _fused_scales(effort: Effort) -> Iterator[Trial]:
     for unit in (1.0, 50.0):
         for offset in (1e2, 1e4, FARTHEST_OFFSET_MM):
             yield f"times {unit:g}, {offset:g} from the origin", _off_plane(unit, offset)
+    for unit in SCALES:
+        yield f"times {unit:g}, turned", _off_plane(unit, 0.0, TURN)
 
 
 def _spoilt_depth(effort: Effort) -> Iterator[Trial]:
@@ -112,44 +113,16 @@ def _fused_repeat(effort: Effort) -> Iterator[Trial]:
         yield f"{threads} threads", differs(with_threads(threads, run), first)
 
 
-def _room(unit: float, offset_mm: float, turn: np.ndarray, frames: int = 6) -> tuple[Scene, Mesh, Cameras]:
-    """Views of the inside of a tube of Gaussians, and its mesh."""
-    grid = np.meshgrid(np.linspace(0, 2 * np.pi, 40, endpoint=False), np.linspace(-0.5, 6, 40))
-    angle, along = (values.ravel() for values in grid)
-    local = np.stack([np.cos(angle), np.sin(angle), along], axis=1)
-    move = np.full(3, offset_mm)
-    points = unit * local @ turn.T + move
-    gaussians = Gaussians.from_points(
-        points, np.full((len(points), 3), 0.5), np.full(len(points), 0.12 * unit), opacity=0.95
-    )
-    # Nothing but position says where a Gaussian is: it is round.
-    gaussians.scales.copy_(gaussians.scales.mean(1, keepdim=True).expand(-1, 3))
-    poses = [
-        compose(turn, unit * turn @ np.array([0.1 * np.sin(k), 0.1 * np.cos(k), 0.4 * k]) + move)
-        for k in range(frames)
-    ]
-    K = np.array([[30.0, 0, 24], [0, 30.0, 20], [0, 0, 1]])
-    cameras = Cameras(np.tile(K, (frames, 1, 1)), np.stack(poses), 48, 40)
-    row, column = np.divmod(np.arange(39 * 40), 40)
-    right = (column + 1) % 40
-    corner = row * 40 + column, row * 40 + right, (row + 1) * 40 + column, (row + 1) * 40 + right
-    triangles = np.concatenate(
-        [np.stack([corner[0], corner[1], corner[2]], 1), np.stack([corner[1], corner[3], corner[2]], 1)]
-    )
-    light = NearFieldLight.initial(frames, unit)
-    return Scene(gaussians, light), Mesh(points.astype(np.float32), triangles.astype(np.int32)), cameras
-
-
 def _carved(unit: float, offset_mm: float, turn: np.ndarray) -> FreeSpace:
-    scene, mesh, cameras = _room(unit, offset_mm, turn)
-    return carve(scene, mesh, cameras, CARVING)
+    room = tube(unit=unit, offset_mm=offset_mm, turn=turn)
+    return carve(room.scene, room.mesh, room.cameras, CARVING)
 
 
 def _carving_invariance(effort: Effort) -> Iterator[Trial]:
     """Free volume in the cube of the unit; where the grid's axes turn, its voxels cut the wall elsewhere."""
-    here = _carved(1.0, 0.0, np.eye(3))
+    here = _carved(1.0, 0.0, UPRIGHT)
     volume = here.free_share * (here.grid_size * here.voxel_mm) ** 3
-    turns = {"": np.eye(3), ", turned": Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()}
+    turns = {"": UPRIGHT, ", turned": TURN}
     for name, turn in turns.items():
         for unit in SCALES:
             found = _carved(unit, 0.0, turn)
@@ -165,7 +138,8 @@ def _carving_invariance(effort: Effort) -> Iterator[Trial]:
 
 
 def _carving_extremes(effort: Effort) -> Iterator[Trial]:
-    scene, mesh, cameras = _room(1.0, 0.0, np.eye(3))
+    room = tube()
+    scene, mesh, cameras = room.scene, room.mesh, room.cameras
     yield "one view", finite_or_refused(partial(carve, scene, mesh, cameras[0], CARVING))
     empty = Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
     yield "no surface", finite_or_refused(partial(carve, scene, empty, cameras, CARVING))
@@ -184,7 +158,7 @@ def _carving_extremes(effort: Effort) -> Iterator[Trial]:
 
 
 def _carving_repeat(effort: Effort) -> Iterator[Trial]:
-    run = partial(_carved, 1.0, 0.0, np.eye(3))
+    run = partial(_carved, 1.0, 0.0, UPRIGHT)
     first = with_threads(1, run)
     for threads in (1, 2, 4):
         found = with_threads(threads, run)
@@ -354,7 +328,7 @@ def _depth_samples(effort: Effort) -> Iterator[Trial]:
 
 def _rows() -> Iterator[Row]:
     planar = "distance from the plane seen, over half a pixel and a tenth of a voxel"
-    yield Row("TSDF", "scale 1e-3 to 1e4, offset to 1e5", planar, 1.0, _fused_scales)
+    yield Row("TSDF", "scale 1e-3 to 1e4, offset to 1e5, rotation", planar, 1.0, _fused_scales)
     yield Row("TSDF", "1 to 1000 frames", planar, 1.0, _frames)
     yield Row("TSDF", "depth with zeros, outliers, steps", "meshes not finite", FINITE, _spoilt_depth)
     yield Row("TSDF", "repeat and threads", "results that differ", EXACT, _fused_repeat)

@@ -13,15 +13,22 @@ from torch import Tensor
 
 from extrags.cameras import Cameras, compose, pixel_rays, rotation_about
 from extrags.raster.bench import BenchSize, bench_scene
+from extrags.sequence import EndoscopicSequence, Split
 
 __all__ = [
     "FARTHEST_OFFSET_MM",
     "GAINS",
     "IMAGES",
+    "PLANE_UNIT_MM",
     "SCALES",
+    "TURN",
+    "UPRIGHT",
     "LitScene",
+    "depth_of_plane",
     "image",
     "lit_tube",
+    "painted",
+    "plane_recording",
     "plane_views",
     "random_lit_scene",
     "slow",
@@ -32,6 +39,10 @@ SCALES = (1e-3, 1e-2, 1.0, 1e2, 1e4)
 FARTHEST_OFFSET_MM = 1e5
 GAINS = (1 / 16, 1.0, 16.0)
 """Of the exposure."""
+UPRIGHT = np.eye(3)
+TURN = rotation_about(np.array([2.0, -5.5, 3.5]) / np.linalg.norm([2.0, -5.5, 3.5]), 1.36)
+"""Of a world by no right angle about any axis."""
+PLANE_UNIT_MM = 20.0
 IMAGES = ("constant", "black", "saturated", "noise", "one bright pixel")
 
 
@@ -180,7 +191,13 @@ def random_lit_scene(seed: int, *, wild: bool = False) -> LitScene:
 
 
 def plane_views(
-    frames: int, width: int, height: int, *, unit: float = 1.0, offset_mm: float = 0.0
+    frames: int,
+    width: int,
+    height: int,
+    *,
+    unit: float = 1.0,
+    offset_mm: float = 0.0,
+    turn: Float[np.ndarray, "3 3"] = UPRIGHT,
 ) -> tuple[Cameras, Float[np.ndarray, "f h w"], Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
     """Views of a slanted plane.
 
@@ -190,24 +207,98 @@ def plane_views(
         height: in pixels.
         unit: half the distance of the plane, in world units; the way grows with it.
         offset_mm: of everything from the origin, along each axis.
+        turn: of everything about that place.
 
     Returns:
         The cameras; exact z-depth, [F, H, W]; the plane's unit normal, and a point of it.
     """
-    turn = rotation_about(np.array([0.3, 1.0, 0.2]) / np.linalg.norm([0.3, 1.0, 0.2]), 0.7)
+    slant = turn @ rotation_about(np.array([0.3, 1.0, 0.2]) / np.linalg.norm([0.3, 1.0, 0.2]), 0.7)
     middle = np.full(3, offset_mm)
     poses = []
     for index in range(frames):
         phase = 2 * math.pi * index / max(frames, 1)
         sway = np.array([0.15 * math.sin(phase), 0.1 * math.cos(phase), 0.05 * math.sin(2 * phase)]) * unit
-        poses.append(compose(turn, middle + sway))
+        poses.append(compose(slant, middle + turn @ sway))
     K = np.array([[0.8 * width, 0, width / 2], [0, 0.8 * width, height / 2], [0, 0, 1.0]])
     cameras = Cameras(np.tile(K, (frames, 1, 1)), np.stack(poses), width, height)
-    normal = turn @ np.array([0.25, -0.15, 1.0]) / np.linalg.norm([0.25, -0.15, 1.0])
-    point = middle + turn @ np.array([0.0, 0.0, 2.0 * unit])
-    rays = pixel_rays(cameras)
-    ahead = ((point - cameras.centers) @ normal)[:, None, None] / (rays @ normal)
-    return cameras, ahead.astype(np.float32), normal, point
+    normal = slant @ np.array([0.25, -0.15, 1.0]) / np.linalg.norm([0.25, -0.15, 1.0])
+    point = middle + slant @ np.array([0.0, 0.0, 2.0 * unit])
+    return cameras, depth_of_plane(cameras, normal, point).astype(np.float32), normal, point
+
+
+def depth_of_plane(
+    cameras: Cameras, normal: Float[np.ndarray, "3"], point: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "f h w"]:
+    """Exact z-depth of a plane in any views; negative where it lies behind them."""
+    ahead = ((point - cameras.centers) @ normal)[:, None, None] / (pixel_rays(cameras) @ normal)
+    return np.asarray(ahead)
+
+
+def painted(
+    cameras: Cameras,
+    depth: Float[np.ndarray, "f h w"],
+    point: Float[np.ndarray, "3"],
+    *,
+    unit: float,
+    turn: Float[np.ndarray, "3 3"] = UPRIGHT,
+) -> Float[np.ndarray, "f h w 3"]:
+    """Colours of a plane's painting in [0.1, 0.7], as views see it; the painting moves and turns with it.
+
+    Args:
+        cameras: the views.
+        depth: of the plane in them.
+        point: of the plane, where the painting begins.
+        unit: of length in the painting.
+        turn: of the world.
+    """
+    K = cameras.K[0]
+    columns, rows = np.meshgrid(np.arange(cameras.width) + 0.5, np.arange(cameras.height) + 0.5)
+    local = np.stack([(columns - K[0, 2]) / K[0, 0], (rows - K[1, 2]) / K[1, 1], np.ones_like(rows)], -1)
+    world = np.einsum("fij,hwj->fhwi", cameras.world_from_camera[:, :3, :3], local) * depth[..., None]
+    on_plane = (world + (cameras.centers - point)[:, None, None]) @ turn / unit
+    return np.asarray(0.4 + 0.3 * np.sin(4 * on_plane + np.array([0.0, 1.0, 2.0])))
+
+
+def plane_recording(
+    frames: int,
+    *,
+    unit: float = PLANE_UNIT_MM,
+    offset_mm: float = 0.0,
+    turn: Float[np.ndarray, "3 3"] = UPRIGHT,
+    size: tuple[int, int] = (32, 24),
+    kind: str = "",
+    gains: Float[np.ndarray, "f"] | None = None,
+    grain: float = 1.0,
+) -> EndoscopicSequence:
+    """A recording of a painted plane, or of images of one kind with the depth of a plane.
+
+    Args:
+        frames: all of them for training.
+        unit: as `plane_views`.
+        offset_mm: as `plane_views`.
+        turn: as `plane_views`.
+        size: width and height of a frame, in pixels.
+        kind: of the images (`image`); empty for the painting.
+        gains: exposure of each frame; None is 1.
+        grain: how coarse the painting is.
+    """
+    width, height = size
+    cameras, depth, _, point = plane_views(frames, width, height, unit=unit, offset_mm=offset_mm, turn=turn)
+    if kind:
+        rgb = image(kind, frames, height, width, 3).numpy()
+    else:
+        rgb = painted(cameras, depth, point, unit=grain * unit, turn=turn)
+    if gains is not None:
+        rgb = (gains[:, None, None, None] * rgb).clip(0, 1)
+    return EndoscopicSequence(
+        name="stress/plane",
+        rgb=np.rint(255 * rgb).astype(np.uint8),
+        K=cameras.K,
+        mask=np.ones(depth.shape, dtype=bool),
+        split=Split("stress", np.arange(frames), np.arange(0)),
+        world_from_camera=cameras.world_from_camera,
+        depth_mm=depth,
+    )
 
 
 def slow(values: Iterator[int], upper: int) -> Iterator[int]:

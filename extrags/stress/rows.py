@@ -6,7 +6,7 @@ import logging
 import math
 import time
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, is_dataclass
 from fnmatch import fnmatchcase
 from typing import Any
@@ -32,6 +32,7 @@ __all__ = [
     "only_refused",
     "relative",
     "run_rows",
+    "same_on_threads",
     "with_threads",
 ]
 
@@ -237,3 +238,21 @@ def with_threads(count: int, compute: Callable[[], Any]) -> Any:
     finally:
         torch.set_num_threads(before[0])
         native.set_num_threads(before[1])
+
+
+def same_on_threads(
+    compute: Callable[[], Any], counts: Sequence[int] = (1, 2, 4), place: str = ""
+) -> Iterator[Trial]:
+    """Trials of a result on one thread, which others must equal to the last bit.
+
+    Args:
+        compute: makes the result anew each time it is called.
+        counts: threads of torch and of the kernels.
+        place: what is computed; goes before their number.
+    """
+    first = with_threads(1, compute)
+    before = f"{place}, " if place else ""
+    for count in counts:
+        # Results without an array would be equal whatever was computed.
+        same = differs(with_threads(count, compute), first) if any(True for _ in _arrays(first)) else math.inf
+        yield f"{before}{count} threads", same

@@ -12,8 +12,8 @@ import torch
 from extrags.config import CoarseConfig, DensifyConfig
 from extrags.errors import ExtragsError
 from extrags.metrics.image import psnr
-from extrags.sequence import EndoscopicSequence, Split
-from extrags.stress.inputs import FARTHEST_OFFSET_MM, IMAGES, SCALES, image, plane_views
+from extrags.sequence import EndoscopicSequence
+from extrags.stress.inputs import FARTHEST_OFFSET_MM, IMAGES, SCALES, TURN, plane_recording
 from extrags.stress.rows import (
     EXACT,
     FINITE,
@@ -27,47 +27,15 @@ from extrags.stress.rows import (
 )
 from extrags.training import reconstruct
 
-__all__ = ["ROWS"]
+__all__ = ["CONFIG", "ROWS", "quality"]
 
 LEVELS = 255
 """Of the images' eight bits: reconstructions whose errors differ by less than one level are equally good."""
 CONFIG = CoarseConfig(iterations=200, max_points=300, sh_degree=0, densify=DensifyConfig(max_gaussians=400))
-UNIT_MM = 20.0
 FRAMES = (1, 2, 10, 100, 1000)
 
 
-def _sequence(
-    frames: int,
-    *,
-    unit: float = UNIT_MM,
-    offset_mm: float = 0.0,
-    size: tuple[int, int] = (32, 24),
-    kind: str = "",
-) -> EndoscopicSequence:
-    """Views of a painted plane, or images of one kind with the depth of a plane."""
-    width, height = size
-    cameras, depth, _, point = plane_views(frames, width, height, unit=unit, offset_mm=offset_mm)
-    if kind:
-        rgb = image(kind, frames, height, width, 3).numpy()
-    else:
-        K = cameras.K[0]
-        columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-        local = np.stack([(columns - K[0, 2]) / K[0, 0], (rows - K[1, 2]) / K[1, 1], np.ones_like(rows)], -1)
-        world = np.einsum("fij,hwj->fhwi", cameras.world_from_camera[:, :3, :3], local) * depth[..., None]
-        on_plane = (world + (cameras.centers - point)[:, None, None]) / unit
-        rgb = 0.4 + 0.3 * np.sin(4 * on_plane + np.array([0.0, 1.0, 2.0]))
-    return EndoscopicSequence(
-        name="stress/plane",
-        rgb=np.rint(255 * rgb).astype(np.uint8),
-        K=cameras.K,
-        mask=np.ones(depth.shape, dtype=bool),
-        split=Split("stress", np.arange(frames), np.arange(0)),
-        world_from_camera=cameras.world_from_camera,
-        depth_mm=depth,
-    )
-
-
-def _quality(sequence: EndoscopicSequence, *, lit: bool = True) -> float:
+def quality(sequence: EndoscopicSequence, *, lit: bool = True) -> float:
     """Root of the mean squared error of the first training views, in levels."""
     config = CONFIG.model_copy(update={"light": CONFIG.light.model_copy(update={"enabled": lit})})
     scene = reconstruct(sequence, config).scene
@@ -80,18 +48,19 @@ def _quality(sequence: EndoscopicSequence, *, lit: bool = True) -> float:
 
 
 def _units(effort: Effort) -> Iterator[Trial]:
-    base = _quality(_sequence(6))
+    base = quality(plane_recording(6))
     for scale in SCALES:
-        yield f"times {scale:g}", abs(_quality(_sequence(6, unit=scale)) - base)
+        yield f"times {scale:g}", abs(quality(plane_recording(6, unit=scale)) - base)
     for offset in (1e2, 1e4, FARTHEST_OFFSET_MM):
-        yield f"{offset:g} from the origin", abs(_quality(_sequence(6, offset_mm=offset)) - base)
+        yield f"{offset:g} from the origin", abs(quality(plane_recording(6, offset_mm=offset)) - base)
+    yield "turned", abs(quality(plane_recording(6, turn=TURN)) - base)
 
 
 def _without_light(effort: Effort) -> Iterator[Trial]:
-    base = _quality(_sequence(6), lit=False)
+    base = quality(plane_recording(6), lit=False)
     for scale in SCALES:
         try:
-            yield f"times {scale:g}", abs(_quality(_sequence(6, unit=scale), lit=False) - base)
+            yield f"times {scale:g}", abs(quality(plane_recording(6, unit=scale), lit=False) - base)
         except ExtragsError as error:
             # A scene so small lies before the near plane; no other is refused.
             if scale >= 1:
@@ -101,12 +70,12 @@ def _without_light(effort: Effort) -> Iterator[Trial]:
 
 def _extremes(effort: Effort) -> Iterator[Trial]:
     for kind in IMAGES:
-        yield kind, _not_finite(_sequence(3, kind=kind))
+        yield kind, _not_finite(plane_recording(3, kind=kind))
     for frames in FRAMES:
-        yield f"{frames} frames", _not_finite(_sequence(frames))
+        yield f"{frames} frames", _not_finite(plane_recording(frames))
     for size in ((1, 1), (1, 9), (9, 1), (2, 2)):
         # Here alone a reconstruction may say that there is too little to go by.
-        found = finite_or_refused(partial(_reconstructed, _sequence(3, size=size)))
+        found = finite_or_refused(partial(_reconstructed, plane_recording(3, size=size)))
         yield f"{size[0]}x{size[1]}", found
 
 
@@ -120,7 +89,7 @@ def _reconstructed(sequence: EndoscopicSequence) -> list[dict[str, torch.Tensor]
 
 
 def _repeat(effort: Effort) -> Iterator[Trial]:
-    run = partial(_parameters, _sequence(4, size=(70, 50)))
+    run = partial(_parameters, plane_recording(4, size=(70, 50)))
     first = with_threads(1, run)
     for threads in (1, 2, 4):
         yield f"{threads} threads", differs(with_threads(threads, run), first)
@@ -133,7 +102,7 @@ def _parameters(sequence: EndoscopicSequence) -> dict[str, torch.Tensor]:
 ROWS = (
     Row(
         "reconstruction",
-        "scale 1e-3 to 1e4, offset to 1e5",
+        "scale 1e-3 to 1e4, offset to 1e5, rotation",
         "change of the error, in levels of 8 bits",
         1.0,
         _units,

@@ -1,4 +1,4 @@
-"""Rows of what works on images: warping, filling, the restorer, depth from stereo, metrics."""
+"""Rows of what works on images: warping, filling, the restorer, depth from stereo."""
 
 from __future__ import annotations
 
@@ -18,12 +18,9 @@ from extrags.depth.frames import PosedFrames
 from extrags.depth.stereo import StereoSettings, multi_view_stereo
 from extrags.depth.weights import load_completion
 from extrags.illumination import NearFieldLight
-from extrags.metrics.depth import depth_errors
-from extrags.metrics.image import psnr_per_image, ssim_map
-from extrags.metrics.registry import metrics
 from extrags.restoration.diffusion.embedded import pretrained
 from extrags.restoration.diffusion.rectified_flow import sample
-from extrags.stress.inputs import FARTHEST_OFFSET_MM, GAINS, IMAGES, SCALES, image, plane_views
+from extrags.stress.inputs import FARTHEST_OFFSET_MM, GAINS, IMAGES, SCALES, TURN, UPRIGHT, image, plane_views
 from extrags.stress.rows import (
     EPS,
     EXACT,
@@ -49,10 +46,16 @@ STEREO = StereoSettings(hypotheses=24, refinement_hypotheses=5)
 
 
 def _references(
-    unit: float, offset_mm: float, *, gain: float = 1.0, rgb: Tensor | None = None, frames: int = 3
+    unit: float,
+    offset_mm: float,
+    *,
+    gain: float = 1.0,
+    rgb: Tensor | None = None,
+    frames: int = 3,
+    turn: np.ndarray = UPRIGHT,
 ) -> tuple[ReferenceViews, Cameras, Tensor]:
     """Exact views of a plane, as references of themselves."""
-    cameras, depth, _, _ = plane_views(frames, 32, 24, unit=unit, offset_mm=offset_mm)
+    cameras, depth, _, _ = plane_views(frames, 32, 24, unit=unit, offset_mm=offset_mm, turn=turn)
     known = torch.from_numpy(depth)[:, None]
     color = image("noise", frames, 3, 24, 32) * 0.5 + 0.2 if rgb is None else rgb
     packed = torch.cat([color, torch.ones_like(known), 1 / known, torch.ones_like(known)], dim=1)
@@ -68,8 +71,8 @@ def _references(
     return references, cameras, known
 
 
-def _warped(unit: float, offset_mm: float, gain: float = 1.0) -> Warped:
-    references, cameras, depth = _references(unit, offset_mm, gain=gain)
+def _warped(unit: float, offset_mm: float, gain: float = 1.0, turn: np.ndarray = UPRIGHT) -> Warped:
+    references, cameras, depth = _references(unit, offset_mm, gain=gain, turn=turn)
     exposure = torch.full((len(cameras),), gain)
     return warp_references(references, cameras, depth, count=2, exposure=exposure)
 
@@ -80,6 +83,7 @@ def _warp_invariance(effort: Effort) -> Iterator[Trial]:
         yield f"times {unit:g}", relative(_warped(unit, 0.0).blend, base.blend)
     for gain in GAINS:
         yield f"exposure times {gain:g}", relative(_warped(1.0, 0.0, gain).blend, base.blend)
+    yield "turned", relative(_warped(1.0, 0.0, turn=TURN).blend, base.blend)
 
 
 def _warp_offset(effort: Effort) -> Iterator[Trial]:
@@ -240,9 +244,10 @@ def _restorer_units(effort: Effort) -> Iterator[Trial]:
 
 
 def _frames(
-    rgb: Tensor, unit: float, offset_mm: float, frames: int = 3
+    rgb: Tensor, unit: float, offset_mm: float, frames: int = 3, turn: np.ndarray = UPRIGHT
 ) -> tuple[PosedFrames, np.ndarray, Cameras]:
-    cameras, depth, _, _ = plane_views(frames, rgb.shape[-1], rgb.shape[-2], unit=unit, offset_mm=offset_mm)
+    height, width = rgb.shape[-2:]
+    cameras, depth, _, _ = plane_views(frames, width, height, unit=unit, offset_mm=offset_mm, turn=turn)
     mask = torch.ones(frames, *rgb.shape[-2:], dtype=torch.bool)
     posed = PosedFrames(
         rgb,
@@ -330,6 +335,8 @@ def _stereo_units(effort: Effort) -> Iterator[Trial]:
         found = _stereo(_frames(_textured(), 20.0, offset)[0], 20.0)
         share = float(((found["log_depth"] - base["log_depth"]).abs() > 0.1 * step).float().mean())
         yield f"times 20, {offset:g} from the origin", share
+    found = _stereo(_frames(_textured(), 1.0, 0.0, turn=TURN)[0], 1.0)
+    yield "turned", float(((found["log_depth"] - base["log_depth"]).abs() > 0.1 * step).float().mean())
 
 
 def _stereo_repeat(effort: Effort) -> Iterator[Trial]:
@@ -357,116 +364,10 @@ def _completion_precision(effort: Effort) -> Iterator[Trial]:
         yield f"seed {seed}, float32", float((plain - exact).abs().max()) / 1e-3
 
 
-def _photometric(render: Tensor, target: Tensor) -> list[float]:
-    region = {"": torch.ones(render.shape[:-1], dtype=torch.bool)}
-    found = []
-    for metric in metrics("photometric"):
-        if metric.measure is not None:
-            found += [value for value in metric.measure(render, target, region)[""] if value is not None]
-    return found
-
-
-def _metric_extremes(effort: Effort) -> Iterator[Trial]:
-    for one in IMAGES:
-        for other in IMAGES:
-            for height, width in ((1, 1), (11, 11), (24, 30)):
-                pair = image(one, 1, height, width, 3), image(other, 1, height, width, 3, seed=1)
-                yield (
-                    f"{one} against {other}, {width}x{height}",
-                    finite_or_refused(partial(_photometric, *pair)),
-                )
-
-
-def _exact_ssim(first: Tensor, second: Tensor) -> Tensor:
-    """SSIM written out: float64, a window of 11 x 11 summed at every pixel, mirrored borders."""
-    offsets = torch.arange(-5, 6, dtype=torch.float64)
-    window = torch.exp(-0.5 * (offsets / 1.5) ** 2)
-    kernel = torch.outer(window, window) / window.sum() ** 2
-    x, y = (np.pad(v.double().numpy(), ((5, 5), (5, 5), (0, 0)), mode="reflect") for v in (first, second))
-    height, width = first.shape[:2]
-    found = torch.zeros(height, width, dtype=torch.float64)
-    for row in range(height):
-        for column in range(width):
-            a, b = (torch.from_numpy(v[row : row + 11, column : column + 11]) for v in (x, y))
-            mean_a, mean_b = ((kernel[..., None] * v).sum((0, 1)) for v in (a, b))
-            # About the mean: no difference of large sums.
-            var_a, var_b = (
-                (kernel[..., None] * (v - mean).square()).sum((0, 1))
-                for v, mean in ((a, mean_a), (b, mean_b))
-            )
-            both = (kernel[..., None] * (a - mean_a) * (b - mean_b)).sum((0, 1))
-            ssim = (2 * mean_a * mean_b + 1e-4) * (2 * both + 9e-4)
-            found[row, column] = (ssim / ((mean_a**2 + mean_b**2 + 1e-4) * (var_a + var_b + 9e-4))).mean()
-    return found
-
-
-def _ssim_error(effort: Effort) -> Iterator[Trial]:
-    for one in IMAGES:
-        for other in ("constant", "noise", "saturated"):
-            first, second = image(one, 14, 13, 3), image(other, 14, 13, 3, seed=1)
-            error = (ssim_map(first[None], second[None])[0].double() - _exact_ssim(first, second)).abs().max()
-            yield f"{one} against {other}", float(error)
-
-
-def _metric_repeat(effort: Effort) -> Iterator[Trial]:
-    pair = image("noise", 2, 90, 120, 3), image("noise", 2, 90, 120, 3, seed=1)
-
-    def run() -> list[list[float]]:
-        # As `evaluate_views` runs it.
-        return in_threads(
-            lambda index: _photometric(*(images[index : index + 1] for images in pair)), range(2)
-        )
-
-    first = with_threads(1, run)
-    for threads in (1, 2, 4):
-        yield f"{threads} threads", differs(with_threads(threads, run), first)
-
-
-def _metric_values(effort: Effort) -> Iterator[Trial]:
-    """What is known without measuring."""
-    for kind in IMAGES:
-        same = image(kind, 1, 24, 30, 3)
-        yield f"SSIM of {kind} with itself", abs(float(ssim_map(same, same).min()) - 1)
-    shifted = psnr_per_image(image("constant", 1, 24, 30, 3), image("constant", 1, 24, 30, 3) + 0.1)[0]
-    yield "PSNR of a difference of 0.1", math.inf if shifted is None else abs(shifted - 20) / 20
-    truth = np.full((1, 8, 8), 2.0, np.float32)
-    for unit in SCALES:
-        errors = depth_errors(1.1 * truth * unit, truth * unit)
-        share = None if errors is None else errors.absrel
-        yield f"AbsRel of 10 %, times {unit:g}", math.inf if share is None else abs(share - 0.1)
-
-
-def _depth_metrics(effort: Effort) -> Iterator[Trial]:
-    truth = np.full((1, 8, 8), 2.0, np.float32)
-    for name, value in {
-        "zero": 0.0,
-        "NaN": math.nan,
-        "infinity": math.inf,
-        "1e-30": 1e-30,
-        "1e30": 1e30,
-        "negative": -1.0,
-    }.items():
-        for one in (True, False):
-            spoilt = truth.copy()
-            spoilt[0, 0, 0] = value
-            pair = (spoilt, truth) if one else (truth, spoilt)
-            yield (
-                f"{name} in {'rendered' if one else 'true'} depth",
-                finite_or_refused(partial(depth_errors, *pair)),
-            )
-        everywhere = np.full_like(truth, value)
-        yield f"{name} everywhere", finite_or_refused(partial(_errors_or_nothing, everywhere, truth))
-
-
-def _errors_or_nothing(rendered: np.ndarray, truth: np.ndarray) -> Any:
-    found = depth_errors(rendered, truth)
-    return [] if found is None else found
-
-
 def _rows() -> Iterator[Row]:
     yield Row(
         "warp",
-        "scale 1e-3 to 1e4, exposure x16 and /16",
+        "scale 1e-3 to 1e4, exposure x16 and /16, rotation",
         "relative change of colours",
         1e-3,
         _warp_invariance,
@@ -482,16 +383,15 @@ def _rows() -> Iterator[Row]:
     )
     yield Row("restorer", "scale 1e-3 to 1e4", "relative change", 1e-3, _restorer_units)
     yield Row("depth", "images without content, poses off", "results not finite", FINITE, _stereo_extremes)
-    yield Row("depth", "scale 1e-3 to 1e4, offset to 1e5", "share of pixels that change", 0.02, _stereo_units)
+    yield Row(
+        "depth",
+        "scale 1e-3 to 1e4, offset to 1e5, rotation",
+        "share of pixels that change",
+        0.02,
+        _stereo_units,
+    )
     yield Row("depth", "float32 and bfloat16", "change over 0.001, and over 0.1", 1.0, _completion_precision)
     yield Row("depth", "repeat and threads", "results that differ", EXACT, _stereo_repeat)
-    yield Row(
-        "metrics", "images without content, from one pixel", "values not finite", FINITE, _metric_extremes
-    )
-    yield Row("metrics", "SSIM to float64", "absolute error", EPS / 9e-4, _ssim_error)
-    yield Row("metrics", "known values", "error", 1e-5, _metric_values)
-    yield Row("metrics", "depth with zeros, NaN, outliers", "values not finite", FINITE, _depth_metrics)
-    yield Row("metrics", "repeat and threads", "results that differ", EXACT, _metric_repeat)
 
 
 ROWS = tuple(_rows())

@@ -139,6 +139,15 @@ class TestCameras:
             Cameras(np.eye(3)[None], np.tile(np.eye(4), (2, 1, 1)), 4, 4)
 
     @pytest.mark.usefixtures("unchecked")
+    @pytest.mark.parametrize("field", ["world_from_camera", "K"])
+    @pytest.mark.parametrize("value", [np.nan, np.inf])
+    def test_what_is_not_finite_is_refused_by_its_position(self, field: str, value: float) -> None:
+        arrays = {"world_from_camera": np.stack([np.eye(4)] * 3), "K": np.stack([np.eye(3)] * 3)}
+        Cameras(**arrays, width=4, height=3).check_finite()
+        arrays[field][1, 0, 2] = value
+        with pytest.raises(PoseError, match=f"{field}: view 1 of 3 holds NaN or infinity"):
+            Cameras(**arrays, width=4, height=3).check_finite()
+
     def test_concatenated_needs_equal_sizes(self) -> None:
         with pytest.raises(ShapeError, match="sizes"):
             Cameras.concatenated([cameras(1), cameras(1).resized(32, 24)])

@@ -9,7 +9,7 @@ from plyfile import PlyData
 
 from extrags.cameras import Cameras, look_at, pixel_rays
 from extrags.config import SurfaceConfig
-from extrags.errors import CaptureError, ShapeError
+from extrags.errors import CaptureError, PoseError, ShapeError
 from extrags.scene import Scene
 from extrags.surface import Mesh, fuse_depth, fuse_surface, rendered_depth
 from extrags.zarr_io import new_group, open_group, read_array, write_array
@@ -129,6 +129,16 @@ class TestFuseDepth:
         cameras, depth = sphere_views(2, 32)
         with pytest.raises(CaptureError, match="min_cluster_triangles = 1000000"):
             fuse_depth(cameras, depth, SurfaceConfig(min_cluster_triangles=1_000_000))
+
+    @pytest.mark.parametrize("value", [np.nan, np.inf])
+    def test_a_camera_that_stands_nowhere_is_refused(self, value):
+        tube = small_tube()
+        poses = tube.cameras.world_from_camera.copy()
+        poses[2, 0, 3] = value
+        lost = replace(tube.cameras, world_from_camera=poses)
+        depth = np.ones((len(lost), lost.height, lost.width), np.float32)
+        with pytest.raises(PoseError, match="world_from_camera: view 2 of 8"):
+            fuse_depth(lost, depth, SurfaceConfig())
 
     def test_depth_of_another_size_is_refused(self):
         cameras, depth = sphere_views(2, 32)

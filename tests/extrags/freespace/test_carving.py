@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from extrags.cameras import Cameras, rotation_about
 from extrags.config import FreespaceConfig
-from extrags.errors import CaptureError, ShapeError
+from extrags.errors import CaptureError, PoseError, ShapeError
 from extrags.freespace import FREE, OCCUPIED, UNKNOWN, FreeSpace, carve, voxel_visibility
 from extrags.freespace.carving import _nearest_error, carving_views
 from extrags.gaussians import Gaussians
@@ -266,6 +266,14 @@ class TestCarve:
         tube = small_tube()
         with pytest.raises(CaptureError, match="no views to carve"):
             carve(tube.scene, small_mesh(), tube.cameras[[]], FreespaceConfig(grid_size=8))
+
+    def test_a_camera_that_stands_nowhere_is_refused(self):
+        tube = small_tube()
+        poses = tube.cameras.world_from_camera.copy()
+        poses[2, 0, 3] = np.nan
+        lost = replace(tube.cameras, world_from_camera=poses)
+        with pytest.raises(PoseError, match="world_from_camera: view 2 of 8"):
+            carve(tube.scene, small_mesh(), lost)
 
     def test_a_volume_without_extent_is_refused(self):
         tube = small_tube()

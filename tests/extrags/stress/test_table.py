@@ -28,6 +28,14 @@ PARTS = {
     "restorer",
     "depth",
     "metrics",
+    "rendering",
+    "assessment",
+    "exploration",
+    "restored views",
+    "fine-tuning",
+    "judge",
+    "evaluation",
+    "pipeline",
 }
 QUICK = Effort(scenes=4, iterations=30, largest=1000)
 CHOSEN = (
@@ -40,6 +48,12 @@ CHOSEN = (
     "lens/depth*",
     "filling",
     "metrics/known*",
+    "rendering",
+    "evaluation",
+    "assessment",
+    "carving/poses*",
+    "lens/repeat*",
+    "depth/exposure*",
 )
 """Rows that take no second, of most parts; the others are run with the benchmark."""
 
