@@ -64,8 +64,9 @@ def measure(
     A pixel of a probe view is a hole where alpha is below `hole_alpha`. A Gaussian is unresolved in a probe
     as far as the training view that shows it largest, inside its mask, has fewer than `sufficient_resolution`
     times the pixels that the probe has of it. Sizes are sums of blending weights: how many Gaussians a
-    surface is made of makes little difference. What a probe lacks are its holes and, with `unresolved_weight`,
-    its unresolved pixels. Budgets are not used here: `decide` turns the numbers into a plan.
+    surface is made of makes little difference. What a probe lacks are its holes and, with
+    `unresolved_weight`, its unresolved pixels. Budgets are not used here: `decide` turns the numbers into a
+    plan.
 
     Args:
         scene: the coarse reconstruction.
