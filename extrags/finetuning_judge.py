@@ -278,7 +278,9 @@ def _finetuned(
 ) -> list[Scene]:
     """The brief reconstructions after fine-tuning as brief, on real views alone for an amount of 0."""
     changes: dict[str, float] = {
-        "iterations": max(1, round(config.judge.iterations_share * config.iterations))
+        "iterations": max(1, round(config.judge.iterations_share * config.iterations)),
+        # For the control as for the other trials, which have none: they tell what virtual views do.
+        "light_cooldown_share": 0.0,
     }
     if amount > 0:
         changes["pseudo_weight"] = amount * config.pseudo_weight

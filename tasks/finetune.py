@@ -62,7 +62,7 @@ def judge(
     slot.counts["amount"] = judgement.amount
 
 
-@stage("finetune", version=17)
+@stage("finetune", version=18)
 def finetune(
     slot: Slot,
     scene: Ref,

@@ -242,6 +242,13 @@ class FinetuneConfig(StageConfig):
     image_confidence: bool = Field(
         True, description="weight virtual views by U_img; without it all have the same, the mean"
     )
+    light_cooldown_share: float = Field(
+        0.5,
+        ge=0,
+        lt=1,
+        description="on real views alone, the learning rates of the light fall in this last share of the "
+        "iterations; with virtual views, whose exposure is fixed, they do not. 0: never",
+    )
     judge: JudgeConfig = JudgeConfig()
     seed: Seed = Field(0, description="seed of all random sampling")
 

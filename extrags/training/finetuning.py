@@ -97,7 +97,8 @@ def finetune(
 
     Which kind a step draws follows a fixed pattern whose share of virtual views falls linearly. The position
     learning rate starts anew. Seeds and densification together may bring the scene to `growth` times the
-    coarse limit. Without pseudo-observations only real views are used: the control of a comparison.
+    coarse limit. Without pseudo-observations only real views are used, and the light cools down
+    (`light_cooldown_share`): with them, half of the steps hold the brightness.
 
     With `keep_scene` the scene's own Gaussians and its light stay as they are: only new ones in holes are
     learned, without densification; where there are none, the scene is returned as it was given.
@@ -133,6 +134,7 @@ def finetune(
             start = _with_filled_holes(scene, sequence, pseudo_views, room, coarse.thickness, depth)
         if config.keep_scene and start is scene:
             return TrainingResult(scene.detached(), [])
+        cooldown_share = config.light_cooldown_share if pseudo_views is None else 0.0
         draw = _draws(sequence, pseudo_views, config, coarse, frame_weights, scene.device)
         # A caller that keeps none either has their floats out of memory while the scene is optimised.
         del pseudo_views
@@ -146,7 +148,9 @@ def finetune(
             densify=coarse.densify.model_copy(update=densify),
         )
         # All harmonics are active from the first step: the scene is optimised already.
-        schedule = replace(schedule, photometric_weight=config.photometric_weight).resumed(seed=config.seed)
+        schedule = replace(
+            schedule, photometric_weight=config.photometric_weight, light_cooldown_share=cooldown_share
+        ).resumed(seed=config.seed)
         if config.keep_scene:
             fixed = len(scene.gaussians)
             return optimise(

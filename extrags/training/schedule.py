@@ -8,10 +8,12 @@ from dataclasses import dataclass, replace
 from extrags.config import DensifyConfig, LightConfig, OptimiserConfig
 from extrags.training.normal_term import NormalTerm
 
-__all__ = ["DECAY_EXPONENT", "Schedule"]
+__all__ = ["DECAY_EXPONENT", "LIGHT_COOLDOWN_FINAL", "Schedule"]
 
 DECAY_EXPONENT = 1.5
 """Of the iteration, in the decay of rates: above 1, so that their sum stays finite."""
+LIGHT_COOLDOWN_FINAL = 0.03
+"""Share of the light's rates that a cool-down leaves at its end."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,8 @@ class Schedule:
     depth_huber_delta: float | None = None
     """Of a Huber loss of depths, in `depth_scale`; None: the depth term compares inverse depths."""
     normals: NormalTerm | None = None
+    light_cooldown_share: float = 0.0
+    """Of the iterations, the last ones, in which the light's rates fall to `LIGHT_COOLDOWN_FINAL`."""
 
     def learning_rates(self, iteration: int) -> dict[str, float]:
         """Rates at an iteration: positions fall log-linearly, the others as `rate_share` says."""
@@ -61,6 +65,16 @@ class Schedule:
         """
         after = self.optimiser.decay_after
         return 1.0 if after is None else float((after / max(after, iteration)) ** DECAY_EXPONENT)
+
+    def light_rate_share(self, iteration: int) -> float:
+        """The same of the light, whose rates also fall log-linearly over the last iterations.
+
+        All pixels hang on a few parameters: where their last steps are long, the brightness of the whole
+        scene ends a few per cent from where it belongs.
+        """
+        begin = (1 - self.light_cooldown_share) * self.iterations
+        cooled = max(0.0, iteration - begin) / max(1.0, self.iterations - begin)
+        return self.rate_share(iteration) * float(LIGHT_COOLDOWN_FINAL**cooled)
 
     def resumed(self, *, seed: int) -> Schedule:
         """The schedule for a scene that exists already: all harmonics are active from the first step."""

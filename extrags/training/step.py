@@ -148,7 +148,7 @@ class AutogradStep:
         self.adam.step(visible=observation.visible)
         self.adam.zero_grad()
         if self._light_adam is not None:
-            share = self._schedule.rate_share(iteration)
+            share = self._schedule.light_rate_share(iteration)
             for group in self._light_adam.param_groups:
                 group["lr"] = share * group["initial_lr"]
             self._light_adam.step()
@@ -220,7 +220,7 @@ class NativeStep:
             raise RuntimeError("update before the first differentiate")
         self.adam.step(visible=observation.visible, gradients=self.direct.gradients)
         if self.light_fit is not None:
-            self.light_fit.step(self.direct.light_gradient, self._schedule.rate_share(iteration))
+            self.light_fit.step(self.direct.light_gradient, self._schedule.light_rate_share(iteration))
 
     def _bound_step(self, density: DensityStrategy) -> DirectStep:
         """The kernels' arrays, made anew where densification has replaced the parameters."""

@@ -18,7 +18,9 @@ from extrags.config import DensifyConfig, FinetuneConfig
 from extrags.pseudo_views import PseudoViews
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
+from extrags.training import TrainingResult
 from extrags.training.finetuning import finetune, virtual_steps, virtual_views
+from extrags.training.schedule import Schedule
 from extrags.training.step import AutogradStep
 from tests.extrags.training.conftest import HEIGHT, WIDTH
 from tests.extrags.training.plain_finetuning import (
@@ -395,3 +397,20 @@ class TestKeptScene:
         assert result.history == []
         for name, values in scene.detached().gaussians.parameters().items():
             assert torch.equal(result.scene.gaussians.parameters()[name], values), name
+
+
+class TestLightCooldown:
+    def test_on_real_views_alone_the_light_comes_to_rest(
+        self, scene: Scene, sequence: EndoscopicSequence, pseudo: PseudoViews, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        asked: list[float] = []
+
+        def recorded(start: Scene, draw: object, schedule: Schedule, **_: object) -> TrainingResult:
+            asked.append(schedule.light_cooldown_share)
+            return TrainingResult(start, [])
+
+        monkeypatch.setattr("extrags.training.finetuning.optimise", recorded)
+        config = FinetuneConfig(light_cooldown_share=0.3)
+        finetune(scene, sequence, None, config, COARSE)
+        finetune(scene, sequence, pseudo, config, COARSE)
+        assert asked == [0.3, 0.0]

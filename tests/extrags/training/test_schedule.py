@@ -9,7 +9,7 @@ import pytest
 
 from extrags.config import CoarseConfig, OptimiserConfig, profile_config
 from extrags.training.reconstruction import coarse_schedule
-from extrags.training.schedule import Schedule
+from extrags.training.schedule import LIGHT_COOLDOWN_FINAL, Schedule
 
 SETTLING = ("quats", "scales", "opacities", "sh0", "shN")
 EXTENT = 7.0
@@ -48,6 +48,14 @@ class TestLearningRates:
         assert all(
             schedule.learning_rates(999)[name] == schedule.learning_rates(0)[name] for name in SETTLING
         )
+
+    def test_those_of_the_light_cool_down_on_top(self) -> None:
+        schedule = schedule_with(100)
+        assert schedule.light_rate_share(1000) == schedule.rate_share(1000)
+        cooled = replace(schedule, light_cooldown_share=0.2)
+        for iteration, part in ((0, 0), (800, 0), (850, 0.25), (900, 0.5), (1000, 1)):
+            expected = LIGHT_COOLDOWN_FINAL**part * schedule.rate_share(iteration)
+            assert cooled.light_rate_share(iteration) == pytest.approx(expected)
 
     def test_positions_fall_log_linearly_whatever_the_others_do(self) -> None:
         for schedule in (schedule_with(100), schedule_with(None)):
