@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import asyncio
 import atexit
+import logging
 import os
 import socket
 import sqlite3
@@ -270,6 +271,8 @@ def _serve(descriptor: int) -> None:
     def watch() -> None:
         while os.read(0, 1):
             pass
+        # Connections that are cancelled on the way down are nobody's error, and the command has had its say.
+        logging.disable(logging.CRITICAL)
         # Nobody is left to talk to: whatever still hinders the server is not waited for, and one that has
         # not started has nothing to end.
         for server in serving:
