@@ -160,7 +160,8 @@ def judge_finetuning(
     control is fine-tuning on the kept frames alone: a brief reconstruction gains by any further step. The
     largest of `AMOUNTS` is kept with which the left-out frames come within `finetune.judge.max_loss_db` of
     the coarse scene and, within noise, of the control (`Trial.holds`); else the control, if it holds against
-    the coarse scene; else nothing.
+    the coarse scene; else nothing. Where the control is what could be kept, it is tried as it would be run:
+    with the cool-down of its light.
 
     Args:
         scene: the coarse scene, trained on `sequence.train`; trials are optimised where it is.
@@ -193,7 +194,8 @@ def judge_finetuning(
         return Judgement(1.0, "not judged: no training frame that can be left out has a valid pixel")
     scenes: dict[float | None, list[Scene]] = {None: [arm.start for arm in arms]}
     before = _psnr_of_arms(arms, scenes[None])
-    scenes[0.0] = _finetuned(arms, 0.0, config, coarse)
+    # The control of virtual views differs from them in nothing else, and so has no cool-down either.
+    scenes[0.0] = _finetuned(arms, 0.0, config, coarse, cooldown=enhancer is None)
     control = _psnr_of_arms(arms, scenes[0.0])
     trials = [_trial(0.0, before, control, control)]
     for amount in AMOUNTS if enhancer is not None else ():
@@ -201,6 +203,12 @@ def judge_finetuning(
         trials.append(_trial(amount, before, _psnr_of_arms(arms, scenes[amount]), control))
         if trials[-1].holds(settings.max_loss_db):
             break
+    else:
+        if enhancer is not None and config.light_cooldown_share > 0:
+            # What could still be kept is real views alone, whose light then comes to rest.
+            scenes[0.0] = _finetuned(arms, 0.0, config, coarse, cooldown=True)
+            alone = _psnr_of_arms(arms, scenes[0.0])
+            trials[0] = _trial(0.0, before, alone, alone)
     for trial in trials:
         emit(MetricRecorded("finetune", f"left_out_gain_db_at_{trial.amount:g}", trial.gain_db))
     left = np.sort(np.concatenate([arm.left_out for arm in arms]))
@@ -274,13 +282,17 @@ def _arms(
 
 
 def _finetuned(
-    arms: Sequence[_Arm], amount: float, config: FinetuneConfig, coarse: CoarseConfig
+    arms: Sequence[_Arm],
+    amount: float,
+    config: FinetuneConfig,
+    coarse: CoarseConfig,
+    *,
+    cooldown: bool = False,
 ) -> list[Scene]:
     """The brief reconstructions after fine-tuning as brief, on real views alone for an amount of 0."""
     changes: dict[str, float] = {
         "iterations": max(1, round(config.judge.iterations_share * config.iterations)),
-        # For the control as for the other trials, which have none: they tell what virtual views do.
-        "light_cooldown_share": 0.0,
+        "light_cooldown_share": config.light_cooldown_share if cooldown else 0.0,
     }
     if amount > 0:
         changes["pseudo_weight"] = amount * config.pseudo_weight

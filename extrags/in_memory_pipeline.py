@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, TypeVar
 from extrags.config import DEFAULT_PROFILE, PROFILES, PipelineConfig
 from extrags.errors import CaptureError, ConfigError
 from extrags.pipeline import Pipeline
-from extrags.stages import StageName
+from extrags.stages import StageName, stages_until
 
 if TYPE_CHECKING:
     from extrags.baselines.uc_nerf.training import UcNerfResult
@@ -175,14 +175,12 @@ class InMemoryPipeline(Pipeline):
 
     def ingest(self) -> None:
         """The sequence was read by the caller; what is wrong elsewhere is said before anything is made."""
-        from extrags.metrics.photometric import try_added_metrics
         from extrags.placement import check_device, run_device
         from extrags.raster import native_isa
 
         native_isa()  # refuses an EXTRAGS_ISA that is not usable
         check_device(self.config)
         self._device = run_device(self.config)
-        try_added_metrics(self._device)
 
     def poses(self) -> None:
         """`extrags.poses.estimate_poses`; frames that cannot be registered are dropped."""
@@ -483,5 +481,11 @@ def run_pipeline(
     config = PROFILES[DEFAULT_PROFILE] if config is None else config
     check_settings_argument(config, PipelineConfig, "run_pipeline", 'extrags.PROFILES["quick"]')
     pipeline = InMemoryPipeline(sequence, config, leave_out, true_surface=true_surface)
+    if "evaluate" in stages_until(until) and "evaluate" not in pipeline.leave_out:
+        from extrags.metrics.photometric import try_added_metrics
+        from extrags.placement import check_device, run_device
+
+        check_device(config)
+        try_added_metrics(run_device(config))
     pipeline.run_stages(until)
     return pipeline.result

@@ -122,8 +122,8 @@ def placements(config: PipelineConfig) -> list[Placement]:
         return [*found, Placement("evaluate", "metrics", device, "", why), _page()]
     found.append(Placement("coarse", "optimisation", device, backend, why))
     found += [
-        Placement("assess", "probe views", device, backend, why),
-        _native("assess", "coverage", weights),
+        Placement("assess", "training views", device, backend, why),
+        _native("assess", "coverage and probe views", weights),
         _native("surface", "depth and TSDF", "median depth by the native kernels; Open3D fuses it there"),
         _native("freespace", "carving", "transmittance at points by the native kernels"),
         _native("explore", "search", weights),

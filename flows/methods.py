@@ -303,7 +303,8 @@ def _uc_nerf(_: PipelineConfig) -> dict[str, Any]:
 
 
 def _real_only(_: PipelineConfig) -> dict[str, Any]:
-    return {"finetune.judge.enabled": False}
+    # A control differs in the virtual views alone.
+    return {"finetune.judge.enabled": False, "finetune.light_cooldown_share": 0.0}
 
 
 def _nothing(_: PipelineConfig) -> dict[str, Any]:

@@ -40,7 +40,7 @@ def preflight(config: PipelineConfig, until: str, leave_out: Collection[str] = (
         from extrags.placement import check_device
 
         check_device(config)
-    if "evaluate" in wanted and added_metrics():
+    if "evaluate" in wanted and "evaluate" not in leave_out and added_metrics():
         # Here, because it loads torch, which looking up a deployment must not.
         from extrags.metrics.photometric import try_added_metrics
         from extrags.placement import run_device

@@ -60,8 +60,8 @@ def assess(
 ) -> None:
     """Measure the scene; writes `measurements.json`.
 
-    The measurements do not depend on budgets, so changed budgets do not repeat them; `plan` decides. Probe
-    views are rendered on the `device`.
+    The measurements do not depend on budgets, so changed budgets do not repeat them; `plan` decides.
+    Training views are rendered on the `device`, probe views where blending weights are.
     """
     from extrags.assessment import measure
     from extrags.devices import chosen_device

@@ -126,7 +126,7 @@ def stereo_folders(place: Path) -> list[StereoFolders]:
 
 def _holds(folder: Path) -> bool:
     try:
-        return bool(image_entries(folder))
+        return any(not is_of_another_kind(file.stem) for file in image_entries(folder))
     except PermissionError:
         # What may not be looked into is not meant.
         return False

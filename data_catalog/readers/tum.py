@@ -92,6 +92,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     )
     colours = [item for item in colours if item.name in present]
     here = [item for item in depths if item.file.is_file()]
+    _tell_of_absent(depths, here, folder / _DEPTH)
     at_s = [item.time_s for item in colours]
     pose_of, depth_of = _nearest(at_s, times_s), _nearest(at_s, [item.time_s for item in here])
     for name, found in ((_POSES, pose_of if len(poses) else None), (_DEPTH, depth_of if depths else None)):
@@ -260,6 +261,27 @@ def _nearest(times_s: Sequence[float], others_s: Sequence[float]) -> dict[float,
             found[time_s] = index
             taken.add(index)
     return found
+
+
+def _tell_of_absent(listed: list[_Listed], here: list[_Listed], listing: Path) -> None:
+    """Warn of listed files that are not there.
+
+    Raises:
+        SourceNotFoundError: none is.
+    """
+    absent = [item for item in listed if item not in here]
+    if listed and not here:
+        raise SourceNotFoundError(
+            f"no such file, as all {len(listed)} that {listing.name} lists",
+            file=absent[0].file,
+            field="depth",
+        )
+    if absent:
+        more = f" and {len(absent) - _NAMED} more" if len(absent) > _NAMED else ""
+        names = ", ".join(item.name for item in absent[:_NAMED])
+        logger.warning(
+            "%s: %d of %d listed files are not there: %s%s", listing, len(absent), len(listed), names, more
+        )
 
 
 def _with_partner(

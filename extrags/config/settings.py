@@ -184,7 +184,7 @@ def _is_not_finite(found: str) -> bool:
 
 def _is_too_large(found: str) -> bool:
     try:
-        return int(found) > LARGEST_WHOLE_NUMBER
+        return float(found) > LARGEST_WHOLE_NUMBER
     except ValueError:
         return False
 

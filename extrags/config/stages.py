@@ -42,8 +42,8 @@ __all__ = [
 class IngestConfig(StageConfig):
     """Reading of a source into an `EndoscopicSequence`."""
 
-    not_in_keys: ClassVar[frozenset[str]] = frozenset({"stereo_camera"})
-    """The fingerprint of the source has it where it is not the usual one, so that older artefacts stay."""
+    not_in_keys_where: ClassVar[dict[str, str]] = {"stereo_camera": "left"}
+    """A setting that came later, at the value that changes nothing: older artefacts stay."""
 
     width: int | None = Field(
         None, ge=16, le=4096, description="image width in pixels; None keeps the source's own"

@@ -42,6 +42,8 @@ ALPHA_EPS = 1e-10
 
 _LAST_ROW_TOLERANCE = 1e-4
 """Of a view matrix; differences of gradients by finite steps are smaller."""
+_OPACITY_ROUNDING = 1e-6
+"""By so much products of opacities in single precision may lie outside [0, 1]."""
 _OPTIONAL = ("sh", "colors", "background", "query_points", "light", "visibility_mask")
 """Of `RasterInputs`."""
 
@@ -138,14 +140,7 @@ def checked_inputs(
         ShapeError: when shapes, dtypes or devices do not fit together, or a size is out of range.
     """
     for name, value in vars(inputs).items():
-        if value is None and name in (
-            "sh",
-            "colors",
-            "background",
-            "query_points",
-            "light",
-            "visibility_mask",
-        ):
+        if value is None and name in _OPTIONAL:
             continue
         if not isinstance(value, Tensor):
             raise ShapeError(f"{name} is {type(value).__name__}, expected a torch tensor")
@@ -237,8 +232,11 @@ def check_values(inputs: RasterInputs) -> None:
     """
     if inputs.opacities.numel():
         low, high = (float(value) for value in torch.aminmax(inputs.opacities.detach()))
-        if low < 0 or high > 1:
-            raise ShapeError(f"opacities are from {low:g} to {high:g}, expected [0, 1], as no logits are")
+        if low < -_OPACITY_ROUNDING or high > 1 + _OPACITY_ROUNDING:
+            raise ShapeError(
+                f"opacities are from {low:.7g} to {high:.7g}, expected [0, 1]; logits go through a sigmoid "
+                "first"
+            )
     # As plain numbers: for the few of a camera, calls on arrays take many times as long.
     matrices = [value.detach().cpu().numpy().tolist() for value in (inputs.Ks, inputs.viewmats)]
     for camera, (K, view) in enumerate(zip(*matrices, strict=True)):

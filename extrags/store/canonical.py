@@ -34,7 +34,8 @@ def canonical(value: Any) -> Any:
     """Canonical JSON form of a value, independent of process, platform and insertion order.
 
     Floats are represented exactly (`float.hex`), pydantic models by their fields (but for those in
-    their `not_in_keys`), refs by their digest alone.
+    their `not_in_keys`, and those of `not_in_keys_where` that have the value given there), refs by their
+    digest alone.
     Tuples and lists are equivalent; `1`, `1.0` and `True` are distinct.
 
     Args:
@@ -65,10 +66,11 @@ def _canonical(value: Any, where: str) -> Any:
         return {"$ref": value.digest}
     if isinstance(value, BaseModel):
         left_out: frozenset[str] = getattr(type(value), "not_in_keys", frozenset())
+        usual: dict[str, Any] = getattr(type(value), "not_in_keys_where", {})
         return {
             name: _canonical(getattr(value, name), f"{where}.{name}")
             for name in type(value).model_fields
-            if name not in left_out
+            if name not in left_out and not (name in usual and getattr(value, name) == usual[name])
         }
     if isinstance(value, list | tuple):
         return [_canonical(item, f"{where}[{index}]") for index, item in enumerate(value)]

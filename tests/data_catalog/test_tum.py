@@ -107,6 +107,16 @@ class TestReading:
         assert len(read(folder)) == 8
         assert "lists 10 frames; 1 of them are absent and left out" in caplog.text
 
+    def test_depth_that_is_listed_and_absent_is_no_matter_of_clocks(self, folder, caplog) -> None:
+        first, *others = sorted((folder / "depth").iterdir())
+        first.unlink()
+        read(folder)
+        assert f"depth.txt: 1 of 10 listed files are not there: depth/{first.name}" in caplog.text
+        for file in others:
+            file.unlink()
+        with pytest.raises(SourceNotFoundError, match=r"no such file, as all 10 that depth.txt lists"):
+            read(folder)
+
     def test_frames_are_in_the_order_of_time(self, folder, clip) -> None:
         lines(folder / "rgb.txt", lambda rows: rows[::-1])
         np.testing.assert_array_equal(read(folder).rgb, clip.rgb)

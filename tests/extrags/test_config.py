@@ -88,6 +88,7 @@ class TestConfig:
             ("enhance.channels", [8, True, 8], "expected 3 whole numbers with commas between"),
             ("enhance.channels", [8, 10**30, 8], "expected 3 whole numbers with commas between"),
             ("coarse.iterations", 2**31, "is 2147483648; expected a whole number from 1 to 2147483647"),
+            ("coarse.iterations", 3e9, "is 3000000000.0; expected a whole number from 1 to 2147483647"),
             ("coarse.iterations", True, "is True; expected a whole number of at least 1"),
             ("coarse.light.exponent", math.inf, "is inf; expected a finite number above 0"),
             ("coarse.light.exponent", "-inf", "is '-inf'; expected a finite number above 0"),

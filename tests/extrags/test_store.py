@@ -17,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import BaseModel
 
-from extrags.config import CoarseConfig
+from extrags.config import CoarseConfig, IngestConfig
 from extrags.errors import ConfigError, DamagedArtefactError, MissingDependencyError, StoreError
 from extrags.store import MANIFEST, Ref, Store, canonical, content_digest, digest_of
 
@@ -413,3 +413,9 @@ class TestUrl:
         monkeypatch.setitem(known_implementations, "undriven", driver)
         with pytest.raises(MissingDependencyError, match="Install no_such_driver"):
             Store("undriven://bucket/prefix")
+
+
+def test_a_setting_that_came_later_counts_where_it_changes_something() -> None:
+    usual = IngestConfig()
+    assert "stereo_camera" not in canonical(usual)
+    assert digest_of(IngestConfig(stereo_camera="right")) != digest_of(usual)

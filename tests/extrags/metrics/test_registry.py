@@ -18,7 +18,7 @@ from torch import Tensor
 
 from extrags.config import LpipsNet, PipelineConfig
 from extrags.errors import ConfigError, NonFiniteError, ShapeError
-from extrags.in_memory_pipeline import InMemoryPipeline
+from extrags.in_memory_pipeline import run_pipeline
 from extrags.metrics import protocol
 from extrags.metrics.comparison import compare_runs, figure_of
 from extrags.metrics.image import means_in_regions
@@ -226,7 +226,11 @@ class TestOwnMetric:
         assert found == [1.0, None] if isinstance(given, list) else found == [0.25, 0.5]
         assert {type(value) for value in found} <= {float, type(None)}
 
-    def test_is_tried_before_a_run(self, sequence: EndoscopicSequence, toy: Metric, unchecked: None) -> None:
+    def test_is_tried_before_a_run(
+        self, sequence: EndoscopicSequence, toy: Metric, unchecked: None, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        # Its frames are no recording.
+        monkeypatch.setattr("extrags.arguments.check_arrays", lambda *_: None)
         try_added_metrics()
         for measure, said in (
             (lambda *_: {}, "metric toy_error: measure gives no values of valid, observed, unobserved"),
@@ -238,10 +242,13 @@ class TestOwnMetric:
             for attempt in (
                 try_added_metrics,
                 lambda: preflight(PipelineConfig(), "report"),
-                lambda: InMemoryPipeline(sequence, PipelineConfig()).ingest(),
+                lambda: run_pipeline(sequence, PipelineConfig()),
             ):
                 with pytest.raises(ConfigError, match=pattern):
                     attempt()
+            # Where nothing is measured, nothing is tried.
+            run_pipeline(sequence, PipelineConfig(), until="ingest")
+            preflight(PipelineConfig(), "report", leave_out={"evaluate": "not wanted here"})
             preflight(PipelineConfig(), "coarse")
 
     @pytest.mark.parametrize(
