@@ -264,6 +264,7 @@ def paper(config: PipelineConfig) -> dict[str, Any]:
         "finetune.keep_scene": False,
         "finetune.confidence_floor": 0.0,
         "finetune.image_confidence": True,
+        "finetune.light_cooldown_share": 0.0,
         "finetune.judge.enabled": False,
         "evaluate.restored": "none",
     }

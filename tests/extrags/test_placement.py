@@ -18,7 +18,7 @@ from tests.extrags.lit_tube import Tube
 
 ON_DEVICE = {
     ("coarse", "optimisation"),
-    ("assess", "probe views"),
+    ("assess", "training views"),
     ("enhance", "leave-out reconstructions"),
     ("finetune", "judge and optimisation"),
     ("evaluate", "held-out views"),

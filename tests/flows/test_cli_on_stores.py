@@ -86,7 +86,7 @@ class TestFinished:
         assert main(["plan", SEQUENCE, *settled(store)]) == 0
         said = capsys.readouterr().out
         assert "explore" in said
-        assert "% of the pixels" in said
+        assert "holes and unresolved surface are" in said
         assert "saves s" in said
         assert "without the plan" in " ".join(said.split())
         measured = said.split("measured")[1].splitlines()

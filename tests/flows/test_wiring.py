@@ -146,7 +146,8 @@ def test_control_on_real_views_alone(finished: tuple[str, SequenceOutcome]) -> N
     store, first = finished
     left_out = dict.fromkeys(("surface", "freespace", "explore", "enhance"), "control")
     runner = DirectRunner(store)
-    config = tiny_config(finetune__iterations=21)
+    # So short a fine-tuning may lose: it is not to be judged here.
+    config = tiny_config(finetune__iterations=21, finetune__judge__enabled=False)
     before = {item.key for item in Store(store).ls("evaluate-views")}
     outcome = run_sequence(SEQUENCE, config, store, runner, until="evaluate", leave_out=left_out)
     # The coarse scene's views have been measured: only the new scene's are.

@@ -226,11 +226,14 @@ class TestRestoredShares:
         self, tube: Tube, renders: RenderedViews
     ) -> None:
         """Restored views a little better than those of the trial are worse than those of the scene."""
-        truth = tube.sequence.rgb[tube.sequence.test].astype(np.float32) / 255
+        # No colour so dark or bright that an error would leave the range.
+        gray = tube.sequence.rgb // 2 + 64
+        sequence = replace(tube.sequence, rgb=gray.astype(np.uint8))
+        truth = sequence.rgb[sequence.test].astype(np.float32) / 255
         rng = np.random.default_rng(0)
         rendered = (truth + 0.10 * rng.choice([-1, 1], truth.shape)).astype(np.float32)
         other = (truth + 0.09 * rng.choice([-1, 1], truth.shape)).astype(np.float32)
-        trials = [(tube.scene, replace(renders, rgb=rendered), tube.sequence)]
+        trials = [(tube.scene, replace(renders, rgb=rendered), sequence)]
 
         def found(error_share: float) -> RestoredShares | None:
             return restored_shares(trials, Shifted(other, 0.0), CONFIG, error_share=error_share)
