@@ -203,12 +203,15 @@ def judge_finetuning(
         trials.append(_trial(amount, before, _psnr_of_arms(arms, scenes[amount]), control))
         if trials[-1].holds(settings.max_loss_db):
             break
-    else:
-        if enhancer is not None and config.light_cooldown_share > 0:
-            # What could still be kept is real views alone, whose light then comes to rest.
-            scenes[0.0] = _finetuned(arms, 0.0, config, coarse, cooldown=True)
-            alone = _psnr_of_arms(arms, scenes[0.0])
-            trials[0] = _trial(0.0, before, alone, alone)
+    if (
+        enhancer is not None
+        and not trials[-1].holds(settings.max_loss_db)
+        and config.light_cooldown_share > 0
+    ):
+        # What could still be kept is real views alone, whose light then comes to rest.
+        scenes[0.0] = _finetuned(arms, 0.0, config, coarse, cooldown=True)
+        alone = _psnr_of_arms(arms, scenes[0.0])
+        trials[0] = _trial(0.0, before, alone, alone)
     for trial in trials:
         emit(MetricRecorded("finetune", f"left_out_gain_db_at_{trial.amount:g}", trial.gain_db))
     left = np.sort(np.concatenate([arm.left_out for arm in arms]))

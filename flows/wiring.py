@@ -476,8 +476,6 @@ class SequenceRun(CachedStages):
         except DamagedArtefactError:
             return []
 
-    # Helpers.
-
     def _scene_inputs(self) -> dict[str, Any]:
         return {"scene": self.refs["coarse"], "sequence": self.refs["training"]}
 

@@ -269,7 +269,8 @@ def _tell_of_absent(listed: list[_Listed], here: list[_Listed], listing: Path) -
     Raises:
         SourceNotFoundError: none is.
     """
-    absent = [item for item in listed if item not in here]
+    present = {item.name for item in here}
+    absent = [item for item in listed if item.name not in present]
     if listed and not here:
         raise SourceNotFoundError(
             f"no such file, as all {len(listed)} that {listing.name} lists",

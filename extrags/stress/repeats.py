@@ -39,6 +39,7 @@ from extrags.metrics.pose import absolute_trajectory_error, relative_pose_error
 from extrags.poses import estimate_poses
 from extrags.restoration.backends import train_enhancer
 from extrags.restoration.clips import render_clips
+from extrags.restoration.protocol import restore_clips
 from extrags.restoration.trajectories import restore
 from extrags.stress.inputs import image
 from extrags.stress.rows import EXACT, Effort, Row, Trial, same_on_threads
@@ -184,7 +185,7 @@ def _restorer(effort: Effort) -> Iterator[Trial]:
     for precision in ("float32", "bfloat16"):
         config = ENHANCE.model_copy(update={"precision": precision})
         enhancer = train_enhancer(small.scene, small.sequence, config, COARSE)
-        yield from same_on_threads(lambda: [enhancer.restore(clip) for clip in clips], place=precision)  # noqa: B023
+        yield from same_on_threads(partial(restore_clips, enhancer, clips), place=precision)
 
 
 def _restored_views(effort: Effort) -> Iterator[Trial]:
