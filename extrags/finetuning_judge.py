@@ -33,7 +33,7 @@ from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence, Split
 from extrags.store.storable import Storable
 from extrags.threads import one_torch_thread
-from extrags.training.finetuning import finetune
+from extrags.training.finetuning import finetune, first_round
 from extrags.training.frame_weights import FrameWeights, frame_weights
 from extrags.training.leave_out import MIN_FRAMES, leave_out_folds, partial_scene
 
@@ -119,10 +119,17 @@ class Judgement(Storable):
     restored_shares: RestoredShares | None = None
 
     def applied_to(self, config: FinetuneConfig) -> FinetuneConfig:
-        """The settings with the weight of virtual views that is kept; for amounts above zero."""
+        """The settings with the weight of virtual views that is kept, and their share in further rounds.
+
+        For amounts above zero; others change nothing.
+        """
         if not self.amount:
             return config
-        return config.model_copy(update={"pseudo_weight": self.amount * config.pseudo_weight})
+        changes = {"pseudo_weight": self.amount * config.pseudo_weight}
+        if self.restored_shares is not None:
+            changes["known_share"] = self.restored_shares.known
+            changes["invented_share"] = self.restored_shares.invented
+        return config.model_copy(update=changes)
 
     def save(self, path: Path) -> None:
         """Write as JSON."""
@@ -293,6 +300,8 @@ def _finetuned(
     cooldown: bool = False,
 ) -> list[Scene]:
     """The brief reconstructions after fine-tuning as brief, on real views alone for an amount of 0."""
+    # Whether guesses harm shows in the first round; the others go on from what it makes.
+    config = first_round(config)
     changes: dict[str, float] = {
         "iterations": max(1, round(config.judge.iterations_share * config.iterations)),
         "light_cooldown_share": config.light_cooldown_share if cooldown else 0.0,

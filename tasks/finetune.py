@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from extrags.config import CoarseConfig, EnhanceConfig, FinetuneConfig
 from extrags.store import Ref, Slot
 from tasks.coarse import HISTORY
@@ -19,7 +21,7 @@ def finetuning_settings(config: FinetuneConfig) -> FinetuneConfig:
 
 
 # The weights' digest is in the key; where their file lies is not. Batches only bound the memory.
-@stage("finetune-judge", version=22, ignore=("weights", "clips_per_batch"))
+@stage("finetune-judge", version=23, ignore=("weights", "clips_per_batch"))
 def judge(
     slot: Slot,
     scene: Ref,
@@ -62,7 +64,7 @@ def judge(
     slot.counts["amount"] = judgement.amount
 
 
-@stage("finetune", version=18)
+@stage("finetune", version=19)
 def finetune(
     slot: Slot,
     scene: Ref,
@@ -90,11 +92,11 @@ def finetune(
     start, frames = slot.load(Scene, scene), slot.load(EndoscopicSequence, sequence)
     start = start.to(chosen_device(device, "device"))
     with keep_last_finite_scene(slot):
-        # No name holds the virtual views here: they are dropped as soon as they are compact.
+        # Loaded once a round, and dropped as soon as they are compact: no name holds the virtual views here.
         result = training.finetune(
             start,
             frames,
-            None if pseudo_views is None else slot.load(PseudoViews, pseudo_views),
+            None if pseudo_views is None else partial(slot.load, PseudoViews, pseudo_views),
             config,
             coarse,
             frame_weights=weights,

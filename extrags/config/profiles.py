@@ -40,7 +40,7 @@ PROFILES: dict[str, PipelineConfig] = {
         explore=ExploreConfig(trajectories=12, length=10, rotation_deg=20.0, orbit_deg=20.0),
         enhance=EnhanceConfig(max_views=96),
         # Less room leaves little detail for what is new.
-        finetune=FinetuneConfig(iterations=1000, growth=1.75),
+        finetune=FinetuneConfig(iterations=2000, rounds=2, growth=2.2),
     ),
     # The default: minutes to a quarter of an hour on two cores.
     "balanced": PipelineConfig(
@@ -55,7 +55,7 @@ PROFILES: dict[str, PipelineConfig] = {
             max_views=240,
         ),
         explore=ExploreConfig(rotation_deg=20.0, orbit_deg=20.0),
-        finetune=FinetuneConfig(iterations=4000, growth=1.5),
+        finetune=FinetuneConfig(iterations=4000, rounds=2, growth=1.9),
         evaluate=EvaluateConfig(lpips_nets=("alex", "vgg")),
     ),
     # The paper's counts, at the full resolution of the source's frames.

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from operator import attrgetter
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, Self
 
-from pydantic import Field, ValidationError, field_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from extrags.config.base import Seed, StageConfig
 from extrags.config.baselines import UcNerfConfig
@@ -186,7 +186,25 @@ class JudgeConfig(StageConfig):
 class FinetuneConfig(StageConfig):
     """Fine-tuning on real and restored views."""
 
-    iterations: int = Field(2000, ge=1, description="optimisation steps, one view each")
+    iterations: int = Field(
+        2000, ge=1, description="optimisation steps of all rounds together, one view each"
+    )
+    rounds: int = Field(
+        1,
+        ge=1,
+        description="how often the steps begin anew: from the second round on virtual views show what was "
+        "restored mixed with what the scene has become, and holes that are left are filled",
+    )
+    known_share: float = Field(
+        0.6,
+        ge=0,
+        le=1,
+        description="in further rounds: of the restored view, where the coarse scene knows the surface; what "
+        "left-out frames tell takes its place",
+    )
+    invented_share: float = Field(
+        0.6, ge=0, le=1, description="in further rounds: of the restored view, where it is invented"
+    )
     densify_share: float = Field(0.6, ge=0, le=1, description="densification ends at this share")
     pseudo_share: float = Field(
         0.5, ge=0, lt=1, description="share of virtual views among the steps, at the start"
@@ -251,6 +269,12 @@ class FinetuneConfig(StageConfig):
     )
     judge: JudgeConfig = JudgeConfig()
     seed: Seed = Field(0, description="seed of all random sampling")
+
+    @model_validator(mode="after")
+    def _a_step_in_each_round(self) -> Self:
+        if self.rounds > self.iterations:
+            raise ValueError(f"{self.rounds} rounds of {self.iterations} iterations in all")
+        return self
 
 
 LpipsNet = Literal["alex", "vgg", "squeeze"]

@@ -204,6 +204,7 @@ REGISTRY: tuple[Stage, ...] = (
             ),
             StageTask(
                 name="finetune",
+                several_loops=True,
                 cost=Cost(
                     terms=(
                         "train*pixels",

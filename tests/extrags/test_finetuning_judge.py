@@ -21,6 +21,7 @@ from extrags.restoration.protocol import Clip, Enhancer, Restoration
 from extrags.restoration.restored_renders import RESTORED_SHARE, RestoredShares, restored_shares
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
+from extrags.training import TrainingResult
 from extrags.training.frame_weights import FrameWeights, frame_weights
 from extrags.training.leave_out import MIN_FRAMES
 from tests.extrags.lit_tube import Tube, tube_cameras
@@ -126,6 +127,22 @@ def test_it_tells_how_much_of_restored_views_serves(tube: Tube, monkeypatch: pyt
     # The tube's scene is the truth, far from what sixty steps reach.
     assert 0 < asked[0] < 0.5
     assert judged(tube, ClassicalEnhancer("")).restored_shares is None
+
+
+def test_the_first_round_is_tried(tube: Tube, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Others go on from what it makes."""
+    tried: list[FinetuneConfig] = []
+
+    def recorded(scene: Scene, _: object, __: object, config: FinetuneConfig, *___: Any, **____: Any) -> Any:
+        tried.append(config)
+        return TrainingResult(scene, [])
+
+    monkeypatch.setattr(finetuning_judge, "finetune", recorded)
+    half = FINETUNE.judge.model_copy(update={"iterations_share": 0.5})
+    config = FINETUNE.model_copy(update={"judge": half, "rounds": 3, "iterations": 60, "growth": 2.0})
+    judged(tube, ClassicalEnhancer(""), config)
+    assert tried
+    assert {(brief.rounds, brief.iterations, brief.growth) for brief in tried} == {(1, 10, 1.6)}
 
 
 def test_errors_outside_the_masks_are_nobodys(tube: Tube) -> None:
@@ -267,6 +284,8 @@ def test_the_weight_of_virtual_views_follows() -> None:
     config = FinetuneConfig(pseudo_weight=2.0)
     assert Judgement(0.3, "").applied_to(config).pseudo_weight == pytest.approx(0.6)
     assert Judgement(1.0, "").applied_to(config) == config
+    shares = Judgement(1.0, "", restored_shares=RestoredShares(known=0.2, invented=0.5)).applied_to(config)
+    assert (shares.known_share, shares.invented_share) == (0.2, 0.5)
     assert Judgement(0.0, "").applied_to(config) == config
 
 

@@ -19,9 +19,10 @@ from extrags.pseudo_views import PseudoViews
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
 from extrags.training import TrainingResult
-from extrags.training.finetuning import finetune, virtual_steps, virtual_views
+from extrags.training.finetuning import finetune
 from extrags.training.schedule import Schedule
 from extrags.training.step import AutogradStep
+from extrags.training.virtual_views import virtual_steps, virtual_views
 from tests.extrags.training.conftest import HEIGHT, WIDTH
 from tests.extrags.training.plain_finetuning import (
     COARSE,

@@ -16,8 +16,8 @@ from extrags.illumination import NearFieldLight
 from extrags.pseudo_views import PseudoViews
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
-from extrags.training import finetuning
-from extrags.training.finetuning import hole_gaussians
+from extrags.training import hole_gaussians as placing
+from extrags.training.hole_gaussians import hole_gaussians
 from extrags.training.starting import LEAST_COLOR
 from tests.extrags.training.conftest import HEIGHT, WIDTH, tube_gaussians, tube_light
 from tests.extrags.training.plain_finetuning import (
@@ -60,16 +60,16 @@ def projected(points: np.ndarray, camera: Any, index: int) -> tuple[np.ndarray, 
 @pytest.fixture(autouse=True)
 def every_point_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     """None is merged with its neighbours (`wall_scene`)."""
-    monkeypatch.setattr(finetuning, "LEAST_SPACING_PX", 0.0)
+    monkeypatch.setattr(placing, "LEAST_SPACING_PX", 0.0)
 
 
 @pytest.fixture
 def real_views_carve_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without the rules on virtual views and on cameras, which have tests of their own."""
     monkeypatch.setattr(
-        finetuning, "_in_front_of_virtual_surface", lambda points, _: np.zeros(len(points), dtype=bool)
+        placing, "_in_front_of_virtual_surface", lambda points, _: np.zeros(len(points), dtype=bool)
     )
-    monkeypatch.setattr(finetuning, "_clear_of_cameras", lambda points, *_: np.ones(len(points), dtype=bool))
+    monkeypatch.setattr(placing, "_clear_of_cameras", lambda points, *_: np.ones(len(points), dtype=bool))
 
 
 class TestSurfaceThatFramesSaw:
@@ -77,7 +77,7 @@ class TestSurfaceThatFramesSaw:
 
     def seen(self, tube_sequence: EndoscopicSequence, **changes: Any) -> np.ndarray:
         scene = Scene(tube_gaussians(), tube_light())
-        return finetuning._real_depth(scene, replace(tube_sequence, **changes), self.FRAME)
+        return placing._real_depth(scene, replace(tube_sequence, **changes), self.FRAME)
 
     def test_gaps_of_measured_depth_are_the_scenes(self, tube_sequence: EndoscopicSequence) -> None:
         """A frame without any depth has the scene's throughout; a highlight must not open a way through."""
@@ -194,7 +194,7 @@ class TestHoleGaussians:
         facing = ((points @ n) ** 2 / square + 0.04) / 1.04
         axis = np.maximum(points[:, 2] / np.sqrt(square), 0.1)
         gain = ((1 + c) / (square + c)) ** e * axis**0.4 * facing**0.35
-        assert gain.min() > finetuning.MIN_GAIN
+        assert gain.min() > placing.MIN_GAIN
         # Highlights are part of the target, not of the albedo.
         lobe = (0.09 / (0.09 + 0.91 * (1 - (points @ n) ** 2 / square))) ** 2
         highlight = 0.05 * lobe * ((1 + c) / (square + c)) ** e * axis**0.4
@@ -258,6 +258,28 @@ class TestHoleGaussians:
             kept = bool(np.all(apart < 1e-3))
             assert kept != hidden, (alpha, uncertainty, shown_mm)
 
+    def test_what_is_filled_by_now_is_no_hole_and_still_not_to_be_hidden(
+        self, sequence: EndoscopicSequence, pseudo: PseudoViews, holes: np.ndarray
+    ) -> None:
+        blind = replace(sequence, mask=np.zeros_like(sequence.mask))
+        holes[1:] = False
+        near = np.full(holes.shape, 6.0)
+        views = wall_views(pseudo, near, holes)
+        every = hole_gaussians(wall_scene(None), blind, views, self.ROOM)
+        assert every is not None
+        filled = np.ones_like(views.alpha)
+        assert hole_gaussians(wall_scene(None), blind, views, self.ROOM, alpha=filled) is None
+        # A second view, a hole when it was restored: completed far behind, and filled by now.
+        views = replace(views, uncertainty=np.ones_like(views.alpha))
+        (_,), (z,) = pseudo.cameras[1].project(every.means.double().numpy())
+        views.depth_mm[1], views.alpha[1] = 1.5 * z.max(), 0.0
+        filled[0] = views.alpha[0]
+        found = hole_gaussians(wall_scene(None), blind, views, self.ROOM, alpha=filled)
+        assert found is not None
+        for gaussians, some in ((every, True), (found, False)):
+            (pixels,), _ = pseudo.cameras[1].project(gaussians.means.double().numpy())
+            assert pseudo.cameras[1].contains(pixels).any() == some
+
     @pytest.mark.usefixtures("real_views_carve_alone")
     def test_none_far_from_all_known_surface(
         self, sequence: EndoscopicSequence, pseudo: PseudoViews, holes: np.ndarray
@@ -273,7 +295,7 @@ class TestHoleGaussians:
         assert 0 < len(new) < len(every)
         apart = torch.cdist(new.means, scene.gaussians.means).min(dim=1).values
         # Points of a cell are averaged, which may move them by its edge.
-        assert apart.max() <= 6.0 + finetuning._typical_spacing(scene.gaussians)
+        assert apart.max() <= 6.0 + placing._typical_spacing(scene.gaussians)
 
     def test_none_nearer_to_a_camera_than_any_surface_that_was_seen(
         self, sequence: EndoscopicSequence, pseudo: PseudoViews, holes: np.ndarray
@@ -330,7 +352,7 @@ class TestHoleGaussians:
         monkeypatch: pytest.MonkeyPatch,
     ) -> None:
         """As after a relocation: the nearest neighbour is a copy, at no distance."""
-        monkeypatch.setattr(finetuning, "LEAST_SPACING_PX", 2.0)
+        monkeypatch.setattr(placing, "LEAST_SPACING_PX", 2.0)
         depth_mm = 10.0
         views = wall_views(pseudo, np.full((3, HEIGHT, WIDTH), depth_mm), holes)
         new = hole_gaussians(wall_scene(None), sequence, views, 10_000)

@@ -16,12 +16,13 @@ from extrags.raster import native
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence, saturated_mask
 from extrags.training import finetuning
-from extrags.training.finetuning import finetune, virtual_views
+from extrags.training.finetuning import finetune
 from extrags.training.optimise import TrainingResult
 from extrags.training.reconstruction import coarse_schedule
 from extrags.training.step import AutogradStep, NativeStep, Observation
 from extrags.training.strategies import density_strategy
 from extrags.training.views import View, in_steps, real_views
+from extrags.training.virtual_views import virtual_views
 from tests.extrags.training.plain_finetuning import masked
 from tests.second_device import DEVICE, second_device
 
@@ -167,7 +168,7 @@ class TestVirtualViews:
 
         monkeypatch.setattr(finetuning, "optimise", optimised)
         # A decorator would hold them: there is none but the checks of shapes, which tests alone have.
-        assert wrappers(finetune) == wrappers(finetuning.virtual_views)
+        assert wrappers(finetune) == wrappers(virtual_views)
         inspect.unwrap(finetune)(scene, sequence, stored(), FinetuneConfig(iterations=1))
         assert alive == [False]
 
