@@ -33,7 +33,7 @@ from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence, Split
 from extrags.store.storable import Storable
 from extrags.threads import one_torch_thread
-from extrags.training.finetuning import finetune, first_round
+from extrags.training.finetuning import finetune
 from extrags.training.frame_weights import FrameWeights, frame_weights
 from extrags.training.leave_out import MIN_FRAMES, leave_out_folds, partial_scene
 
@@ -301,7 +301,7 @@ def _finetuned(
 ) -> list[Scene]:
     """The brief reconstructions after fine-tuning as brief, on real views alone for an amount of 0."""
     # Whether guesses harm shows in the first round; the others go on from what it makes.
-    config = first_round(config)
+    config = config.first_round
     changes: dict[str, float] = {
         "iterations": max(1, round(config.judge.iterations_share * config.iterations)),
         "light_cooldown_share": config.light_cooldown_share if cooldown else 0.0,

@@ -197,6 +197,8 @@ PAPER_SHARED = frozenset(
         "explore.unresolved_error",
         "explore.destinations",
         "explore.min_view_gain",
+        "finetune.known_share",  # of further rounds, which it has not
+        "finetune.invented_share",
         "finetune.seed",
         "finetune.judge.iterations_share",  # switched off
         "finetune.judge.leave_out_every",
@@ -265,6 +267,7 @@ def paper(config: PipelineConfig) -> dict[str, Any]:
         "finetune.confidence_floor": 0.0,
         "finetune.image_confidence": True,
         "finetune.light_cooldown_share": 0.0,
+        "finetune.rounds": 1,
         "finetune.judge.enabled": False,
         "evaluate.restored": "none",
     }

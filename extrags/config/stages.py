@@ -183,6 +183,10 @@ class JudgeConfig(StageConfig):
     )
 
 
+EARLIER_GROWTH_SHARE = 0.8
+"""Of `finetune.growth`, before the last of several rounds."""
+
+
 class FinetuneConfig(StageConfig):
     """Fine-tuning on real and restored views."""
 
@@ -192,8 +196,8 @@ class FinetuneConfig(StageConfig):
     rounds: int = Field(
         1,
         ge=1,
-        description="how often the steps begin anew: from the second round on virtual views show what was "
-        "restored mixed with what the scene has become, and holes that are left are filled",
+        description="with virtual views, how often the steps begin anew: from the second round on these show "
+        "what was restored mixed with what the scene has become, and holes that are left are filled",
     )
     known_share: float = Field(
         0.6,
@@ -275,6 +279,25 @@ class FinetuneConfig(StageConfig):
         if self.rounds > self.iterations:
             raise ValueError(f"{self.rounds} rounds of {self.iterations} iterations in all")
         return self
+
+    @property
+    def steps_of_rounds(self) -> tuple[int, ...]:
+        """The iterations of each round: as even as they can be."""
+        ends = [round(self.iterations * (number + 1) / self.rounds) for number in range(self.rounds)]
+        return tuple(end - begin for begin, end in zip([0, *ends[:-1]], ends, strict=True))
+
+    @property
+    def growth_before_last(self) -> float:
+        """`growth` in all rounds but the last, which so has room for the holes that are left."""
+        return max(1.0, EARLIER_GROWTH_SHARE * self.growth)
+
+    @property
+    def first_round(self) -> FinetuneConfig:
+        """Settings of the first of the rounds alone."""
+        if self.rounds == 1:
+            return self
+        first = {"rounds": 1, "iterations": self.steps_of_rounds[0], "growth": self.growth_before_last}
+        return self.model_copy(update=first)
 
 
 LpipsNet = Literal["alex", "vgg", "squeeze"]

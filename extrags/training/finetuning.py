@@ -23,10 +23,8 @@ from extrags.training.starting import median_depth
 from extrags.training.views import View, epochs, real_views
 from extrags.training.virtual_views import shown_again, virtual_steps, virtual_views
 
-__all__ = ["finetune", "first_round"]
+__all__ = ["finetune"]
 
-FIRST_ROUNDS_SHARE = 0.8
-"""Of `finetune.growth`, in all rounds but the last, which so has room for the holes that are left."""
 MAX_GUESS_DISTANCE = 1.0
 """In median depths. Farther from known surface completed depth says nothing; nearer, a wall at a third too
 short a distance is less wrong than none at all."""
@@ -66,9 +64,9 @@ def finetune(
     coarse limit. Without pseudo-observations only real views are used, and the light cools down
     (`light_cooldown_share`): with them, half of the steps hold the brightness.
 
-    The iterations fall into `rounds`. In each but the first, virtual views are compared with what was
-    restored and what the scene has become, mixed (`shown_again`), holes that are left get new Gaussians, and
-    pattern and learning rates start anew.
+    With virtual views the iterations fall into `rounds`. In each but the first, these views are compared with
+    what was restored and what the scene has become, mixed (`shown_again`), holes that are left get new
+    Gaussians, and pattern and learning rates start anew.
 
     With `keep_scene` the scene's own Gaussians and its light stay as they are: only new ones in holes are
     learned, without densification; where there are none, the scene is returned as it was given.
@@ -96,6 +94,8 @@ def finetune(
     with one_torch_thread():
         config = PROFILES[DEFAULT_PROFILE].finetune if config is None else config
         coarse = PROFILES[DEFAULT_PROFILE].coarse if coarse is None else coarse
+        if pseudo_views is None:
+            config = config.model_copy(update={"rounds": 1})
         load = pseudo_views if callable(pseudo_views) else _loaded_once(pseudo_views, config.rounds)
         del pseudo_views
         current, history = scene, []
@@ -111,24 +111,10 @@ def finetune(
                 frame_weights=frame_weights,
                 fixed=len(scene.gaussians),
             )
-            before = sum(round_steps(config)[:number])
+            before = sum(config.steps_of_rounds[:number])
             history += [{**entry, "iteration": entry["iteration"] + before} for entry in found.history]
             current = found.scene
         return TrainingResult(current, history)
-
-
-def first_round(config: FinetuneConfig) -> FinetuneConfig:
-    """Settings of the first of the rounds alone."""
-    if config.rounds == 1:
-        return config
-    growth = max(1.0, FIRST_ROUNDS_SHARE * config.growth)
-    return config.model_copy(update={"rounds": 1, "iterations": round_steps(config)[0], "growth": growth})
-
-
-def round_steps(config: FinetuneConfig) -> list[int]:
-    """The iterations of each round: as even as they can be."""
-    ends = [round(config.iterations * (number + 1) / config.rounds) for number in range(config.rounds)]
-    return [end - begin for begin, end in zip([0, *ends], ends, strict=False)]
 
 
 def _loaded_once(pseudo_views: PseudoViews | None, rounds: int) -> Callable[[], PseudoViews | None]:
@@ -152,10 +138,10 @@ def _round(
     """One round of `finetune`; with `keep_scene` the first `fixed` Gaussians stay as they are."""
     frames, last = sequence.train, number == config.rounds - 1
     depth = median_depth(sequence, frames)
-    share = 1.0 if last else FIRST_ROUNDS_SHARE
-    max_gaussians = round(share * config.growth * coarse.densify.max_gaussians)
+    growth = config.growth if last else config.growth_before_last
+    max_gaussians = round(growth * coarse.densify.max_gaussians)
     start, pseudo_views = scene, load()
-    cooldown_share = config.light_cooldown_share if pseudo_views is None and last else 0.0
+    cooldown_share = config.light_cooldown_share if pseudo_views is None else 0.0
     if pseudo_views is not None:
         targets, alpha = pseudo_views, None
         if number > 0 and len(pseudo_views):
@@ -187,7 +173,7 @@ def _round(
         scene_extent(sequence, frames),
         depth,
         stage,
-        iterations=round_steps(config)[number],
+        iterations=config.steps_of_rounds[number],
         densify=coarse.densify.model_copy(update=densify),
     )
     # All harmonics are active from the first step: the scene is optimised already.

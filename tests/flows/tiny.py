@@ -73,8 +73,9 @@ TINY: dict[str, Any] = {
     "enhance.keyframes": 2,
     "enhance.max_views": 4,
     "enhance.clips_per_batch": 1,
-    # Fewer, and the judge would keep real views alone: nothing after it would rest on the virtual ones.
-    "finetune.iterations": 30,
+    # Of two rounds. Fewer, and the judge would keep real views alone: nothing after it would rest on the
+    # virtual ones.
+    "finetune.iterations": 60,
     "report.held_out_views": 1,
     "report.virtual_views": 1,
 }

@@ -19,7 +19,7 @@ from extrags.pseudo_views import PseudoViews
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
 from extrags.training import TrainingResult, finetuning
-from extrags.training.finetuning import finetune, first_round
+from extrags.training.finetuning import finetune
 from extrags.training.schedule import Schedule
 from extrags.training.views import View
 from extrags.training.virtual_views import shown_again
@@ -136,12 +136,15 @@ class TestRounds:
         # The last round has room left.
         assert (less, room) == (round(0.6 * N_GAUSSIANS), N_GAUSSIANS)
 
-    def test_of_real_views_alone_the_last_one_cools_the_light(
+    def test_real_views_alone_have_one(
         self, scene: Scene, sequence: EndoscopicSequence, rounds: list[Run]
     ) -> None:
-        config = config_of("weighted_mean", rounds=3, light_cooldown_share=0.3)
-        finetune(scene, sequence, None, config, COARSE)
-        assert [run.schedule.light_cooldown_share for run in rounds] == [0.0, 0.0, 0.3]
+        config = config_of("weighted_mean", iterations=40, rounds=2, growth=2.0)
+        coarse = COARSE.model_copy(update={"densify": DensifyConfig(max_gaussians=N_GAUSSIANS)})
+        finetune(scene, sequence, None, config, coarse)
+        (run,) = rounds
+        assert run.schedule.iterations == 40
+        assert run.schedule.densify.max_gaussians == 2 * N_GAUSSIANS
 
     def test_virtual_views_are_loaded_once_a_round_and_dropped(
         self, scene: Scene, sequence: EndoscopicSequence, pseudo: PseudoViews, monkeypatch: pytest.MonkeyPatch
@@ -178,13 +181,13 @@ class TestFirstRound:
     @pytest.mark.parametrize("profile", ["quick", "balanced"])
     def test_has_its_steps_and_its_room(self, profile: str) -> None:
         config = PROFILES[profile].finetune
-        alone = first_round(config)
+        alone = config.first_round
         assert (alone.rounds, alone.iterations) == (1, config.iterations // config.rounds)
         assert alone.growth == pytest.approx(0.8 * config.growth)
 
     def test_of_one_is_all(self) -> None:
         config = PROFILES["paper"].finetune
-        assert first_round(config) == config
+        assert config.first_round == config
 
     def test_every_round_has_a_step(self) -> None:
         with pytest.raises(ValidationError, match="3 rounds of 2 iterations"):
