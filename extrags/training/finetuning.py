@@ -164,7 +164,9 @@ def _round(
         del targets
     if config.keep_scene and len(start.gaussians) == fixed:
         return TrainingResult(scene.detached(), [])
-    draw = _draws(sequence, pseudo_views, config, coarse, frame_weights, scene.device)
+    steps = config.steps_of_rounds[number]
+    own = config.model_copy(update={"iterations": steps, "rounds": 1})
+    draw = _draws(sequence, pseudo_views, own, coarse, frame_weights, scene.device)
     # A caller that keeps none either has their floats out of memory while the scene is optimised.
     del pseudo_views
     densify = {"start_share": 0.0, "stop_share": config.densify_share, "max_gaussians": max_gaussians}
@@ -173,7 +175,7 @@ def _round(
         scene_extent(sequence, frames),
         depth,
         stage,
-        iterations=config.steps_of_rounds[number],
+        iterations=steps,
         densify=coarse.densify.model_copy(update=densify),
     )
     # All harmonics are active from the first step: the scene is optimised already.

@@ -22,7 +22,7 @@ from extrags.training import TrainingResult, finetuning
 from extrags.training.finetuning import finetune
 from extrags.training.schedule import Schedule
 from extrags.training.views import View
-from extrags.training.virtual_views import shown_again
+from extrags.training.virtual_views import shown_again, virtual_steps
 from tests.extrags.training.plain_finetuning import COARSE, N_GAUSSIANS, Run, config_of, virtual_index
 
 STEP = 1 / 255
@@ -95,6 +95,15 @@ class TestRounds:
             brightness = run.start.gaussians.sh0 - scene.gaussians.sh0
             torch.testing.assert_close(brightness, torch.full_like(brightness, 0.1 * number))
         assert torch.equal(result.scene.gaussians.sh0, brighter(rounds[-1].start).gaussians.sh0)
+
+    def test_in_each_the_share_of_virtual_views_falls_to_its_end(
+        self, scene: Scene, sequence: EndoscopicSequence, pseudo: PseudoViews, rounds: list[Run]
+    ) -> None:
+        config = config_of("paper", iterations=100, rounds=2, pseudo_share=0.8, pseudo_share_final=0.0)
+        finetune(scene, sequence, pseudo, config, COARSE)
+        alone = FinetuneConfig(iterations=50, pseudo_share=0.8, pseudo_share_final=0.0)
+        for run in rounds:
+            assert [run.draw(step).frame is None for step in range(50)] == virtual_steps(alone).tolist()
 
     def test_virtual_views_of_later_rounds_show_what_the_scene_has_become(
         self, scene: Scene, sequence: EndoscopicSequence, pseudo: PseudoViews, rounds: list[Run]
