@@ -87,9 +87,10 @@ def shown_again(
     """Virtual views as targets of a further round: restored ones mixed with what the scene has become.
 
     Views restored one by one are guesses that do not agree; the scene is what they have agreed on, and blurs
-    them. With c and a the scene's colour (before black) and opacity, and the share s of the restored view,
-    `finetune.known_share` where the uncertainty is 0 and `finetune.invented_share` where it is 1, the target
-    is `(1 - (1 - s) a) restored + (1 - s) c`. Where the scene has a surface, its depth is the target's.
+    them. With c and a the scene's colour (before black, as it was trained to meet its targets) and opacity,
+    and the share s of the restored view, `finetune.known_share` where the uncertainty is 0 and
+    `finetune.invented_share` where it is 1, the target is `(1 - t) restored + t c` with `t = (1 - s) a`.
+    Where the scene has a surface, its depth is the target's.
 
     Source: targets that are renewed from the scene are an idea of [Difix2025], see docs/references.md, where
     they are restored anew; here nothing is.
@@ -112,8 +113,9 @@ def shown_again(
         )
         uncertainty = pseudo_views.uncertainty[index]
         share = config.known_share + (config.invented_share - config.known_share) * uncertainty
-        of_scene = 1 - share[..., None]
-        mixed = (1 - of_scene * opacity[..., None]) * pseudo_views.restored[index] + of_scene * shown
+        # A hole has no colour that could be met.
+        of_scene = ((1 - share) * opacity)[..., None]
+        mixed = (1 - of_scene) * pseudo_views.restored[index] + of_scene * shown
         solid = (opacity > HOLE_ALPHA) & (distance > 0)
         rgb.append(np.rint(mixed.clip(0, 1) * 255).astype(np.float32) / np.float32(255))
         alpha.append(opacity)

@@ -47,7 +47,7 @@ def brighter(scene: Scene) -> Scene:
 
 class TestShownAgain:
     @pytest.mark.parametrize(("known", "invented"), [(0.6, 0.6), (0.0, 0.7), (1.0, 1.0)])
-    def test_is_what_was_restored_with_the_scene_laid_over_it(
+    def test_is_what_was_restored_and_the_scene_as_far_as_it_has_a_surface(
         self, scene: Scene, pseudo: PseudoViews, known: float, invented: float
     ) -> None:
         config = FinetuneConfig(known_share=known, invented_share=invented)
@@ -56,12 +56,11 @@ class TestShownAgain:
         with torch.no_grad():
             rendering = changed.render(pseudo.cameras)
         np.testing.assert_allclose(alpha, rendering.alpha.numpy(), rtol=0, atol=1e-6)
-        black = rendering.rgb.double().numpy()
-        opacity = rendering.alpha.double().numpy()[..., None]
-        over_restored = black + (1 - opacity) * pseudo.restored
-        u = pseudo.uncertainty.astype(np.float64)[..., None]
-        share = known * (1 - u) + invented * u
-        expected = share * pseudo.restored + (1 - share) * over_restored
+        shown = rendering.rgb.double().numpy()
+        opacity = rendering.alpha.double().numpy()
+        u = pseudo.uncertainty.astype(np.float64)
+        of_scene = opacity * ((1 - known) * (1 - u) + (1 - invented) * u)
+        expected = pseudo.restored + of_scene[..., None] * (shown - pseudo.restored)
         assert np.abs(found.target - expected.clip(0, 1)).max() <= STEP / 2 + 1e-5
         assert np.array_equal(found.restored, found.target)
         # As they are stored, so that one step's worth of memory holds them.
