@@ -16,6 +16,7 @@ from extrags.sequence import EndoscopicSequence
 from extrags.threads import one_torch_thread
 from extrags.training.filling import FillingStep, filling_schedule
 from extrags.training.frame_weights import FrameWeights, weighted_views
+from extrags.training.frame_weights import frame_weights as found_weights
 from extrags.training.hole_gaussians import hole_gaussians
 from extrags.training.optimise import TrainingResult, optimise
 from extrags.training.reconstruction import coarse_schedule, scene_extent, smallest_footprint
@@ -98,6 +99,9 @@ def finetune(
             config = config.model_copy(update={"rounds": 1})
         load = pseudo_views if callable(pseudo_views) else _loaded_once(pseudo_views, config.rounds)
         del pseudo_views
+        if config.rounds > 1 and coarse.inconsistent_frames == "weight" and frame_weights is None:
+            # Once for all rounds.
+            frame_weights = found_weights(sequence, sequence.train)
         current, history = scene, []
         for number in range(config.rounds):
             found = _round(
