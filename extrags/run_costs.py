@@ -127,8 +127,7 @@ class Workload:
             * (enhance.judge or enhance.train_iterations > 0),
             "judge_pairs": float(min(2 * self.train, enhance.judge_pairs)) * enhance.judge,
             "views": float(enhance.max_views if self.views is None else self.views),
-            # Of the first round alone.
-            "judge_iterations": judge.iterations_share * config.finetune.iterations / config.finetune.rounds,
+            "judge_iterations": judge.iterations_share * config.finetune.first_round.iterations,
             "judge_views": float(judge.views),
             "tuning": float(config.finetune.iterations),
             # LPIPS with this backbone takes longer than all other metrics together.

@@ -101,8 +101,8 @@ def shown_again(
         config: the shares.
 
     Returns:
-        The views with other colours and depths, in the steps in which images are stored, and the scene's
-        opacity in them.
+        The views with other colours (in [0, 1], in the steps of 1/255 in which images are stored) and depths
+        (in world units), and the scene's opacity in them, [V, H, W].
     """
     rgb, alpha, depth_mm = (FrameStack(len(pseudo_views)) for _ in range(3))
     for index in range(len(pseudo_views)):
