@@ -5,7 +5,7 @@ space. Each *row*, a Gaussian j or a frontier voxel f behind a hole, has in a pr
 the sum of its blending weights, or the number of empty pixels whose rays leave free space through the voxel.
 What a view shows of a row is good enough from a share rho of that size on: surface that training showed with
 fewer pixels than a view off the trajectory has of it is what the reconstruction is wrong about. From how many
-directions it was seen says nothing about that (docs/algorithms/exploration.md has the measurement).
+directions it was seen says nothing about that (docs/experiments/exploration.md has the measurement).
 """
 
 from __future__ import annotations
