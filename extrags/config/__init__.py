@@ -9,6 +9,7 @@ from extrags.config.coarse import *  # noqa: F403
 from extrags.config.continuation import *  # noqa: F403
 from extrags.config.depth import *  # noqa: F403
 from extrags.config.exploration import *  # noqa: F403
+from extrags.config.finetuning import *  # noqa: F403
 from extrags.config.imported import *  # noqa: F403
 from extrags.config.poses import *  # noqa: F403
 from extrags.config.profiles import *  # noqa: F403

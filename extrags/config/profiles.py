@@ -7,8 +7,9 @@ from typing import Literal
 from extrags.config.baselines import UcNerfConfig
 from extrags.config.coarse import CoarseConfig, DensifyConfig, OptimiserConfig
 from extrags.config.exploration import ExploreConfig
+from extrags.config.finetuning import FinetuneConfig
 from extrags.config.restorer import EnhanceConfig
-from extrags.config.stages import EvaluateConfig, FinetuneConfig, IngestConfig, PipelineConfig
+from extrags.config.stages import EvaluateConfig, IngestConfig, PipelineConfig
 from extrags.errors import ConfigError
 
 __all__ = ["DEFAULT_PROFILE", "PROFILES", "ProfileName", "profile_config"]

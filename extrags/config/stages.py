@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from operator import attrgetter
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal
 
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import Field, ValidationError, field_validator
 
 from extrags.config.base import Seed, StageConfig
 from extrags.config.baselines import UcNerfConfig
@@ -19,6 +19,7 @@ from extrags.config.coarse import CoarseConfig
 from extrags.config.continuation import ContinuationConfig
 from extrags.config.depth import DepthConfig
 from extrags.config.exploration import ExploreConfig, FreespaceConfig, SurfaceConfig
+from extrags.config.finetuning import FinetuneConfig
 from extrags.config.imported import ImportedConfig
 from extrags.config.poses import PosesConfig
 from extrags.config.restorer import EnhanceConfig
@@ -30,9 +31,7 @@ from extrags.thresholds import HOLE_ALPHA
 __all__ = [
     "AssessConfig",
     "EvaluateConfig",
-    "FinetuneConfig",
     "IngestConfig",
-    "JudgeConfig",
     "LpipsNet",
     "PipelineConfig",
     "ReportConfig",
@@ -164,140 +163,6 @@ class AssessConfig(StageConfig):
     )
     force: bool = Field(False, description="run every stage whatever the measurements say")
     seed: Seed = Field(0, description="seed of all random sampling")
-
-
-class JudgeConfig(StageConfig):
-    """Leave-out test of the fine-tuning: how much of it to keep."""
-
-    enabled: bool = Field(True, description="False: fine-tuning is kept whatever it does to real views")
-    leave_out_every: int = Field(
-        5, ge=2, description="one in so many training frames is left out of the trial scene, in short runs"
-    )
-    iterations_share: float = Field(
-        0.4, gt=0, le=1, description="share of the iterations of both stages that a trial has"
-    )
-    views: int = Field(32, ge=1, description="virtual views restored for the trials")
-    max_width: int = Field(160, ge=16, description="wider frames are downscaled for the trials")
-    max_loss_db: float = Field(
-        0.1, ge=0, description="mean PSNR that left-out frames may lose against the coarse scene"
-    )
-
-
-EARLIER_GROWTH_SHARE = 0.8
-"""Of `finetune.growth`, before the last of several rounds."""
-
-
-class FinetuneConfig(StageConfig):
-    """Fine-tuning on real and restored views."""
-
-    iterations: int = Field(
-        2000, ge=1, description="optimisation steps of all rounds together, one view each"
-    )
-    rounds: int = Field(
-        1,
-        ge=1,
-        description="with virtual views, how often the steps begin anew: from the second round on these show "
-        "what was restored mixed with what the scene has become, and holes that are left are filled",
-    )
-    known_share: float = Field(
-        0.6,
-        ge=0,
-        le=1,
-        description="in further rounds: of the restored view, where the coarse scene knows the surface; what "
-        "left-out frames tell takes its place",
-    )
-    invented_share: float = Field(
-        0.6, ge=0, le=1, description="in further rounds: of the restored view, where it is invented"
-    )
-    densify_share: float = Field(0.6, ge=0, le=1, description="densification ends at this share")
-    pseudo_share: float = Field(
-        0.5, ge=0, lt=1, description="share of virtual views among the steps, at the start"
-    )
-    pseudo_share_final: float = Field(0.0, ge=0, lt=1, description="the same at the end; linear in between")
-    pseudo_weight: float = Field(
-        3.0,
-        gt=0,
-        description="weight of all virtual views: U_img alone is about 0.2 in a tube, which "
-        "would let the real views overrule what the virtual ones add",
-    )
-    pseudo_depth: bool = Field(
-        True, description="restored depth supervises where the scene knows nothing of a pixel"
-    )
-    loss: Literal["weighted_mean", "weighted_sum", "paper"] = Field(
-        "weighted_mean",
-        description="colour terms of a virtual view. weighted_mean: L1 and D-SSIM weighted by U_pixel, over "
-        "its sum, so that only its pattern counts; weighted_sum: the same over the number of pixels, so that "
-        "its magnitude counts; paper: over the number of pixels, D-SSIM without weights",
-    )
-    dssim_weight: float | None = Field(
-        None, ge=0, le=1, description="lambda in fine-tuning; None: coarse.dssim_weight"
-    )
-    photometric_weight: float = Field(
-        1.0,
-        gt=0,
-        description="factor of (1 - lambda) L1 + lambda (1 - SSIM) / 2 of all views; 3 with lambda = 2/3 is "
-        "L1 + (1 - SSIM)",
-    )
-    depth_weight: float | None = Field(
-        None, ge=0, description="weight of the inverse-depth term; None: coarse.depth_weight"
-    )
-    growth: float = Field(
-        2.0,
-        ge=1,
-        description="limit on the number of Gaussians, seeds and densification together, times "
-        "coarse.densify.max_gaussians",
-    )
-    seed_holes: bool = Field(
-        True, description="place new Gaussians where the restored view has surface and none is"
-    )
-    keep_known: bool = Field(
-        True, description="u * restored + (1 - u) * rendered instead of the restored image alone"
-    )
-    keep_scene: bool = Field(
-        False,
-        description="the scene's own Gaussians and light stay: only new ones in holes are learned. "
-        "imported.keep switches it on for imported scenes",
-    )
-    confidence_floor: float = Field(
-        0.1, ge=0, le=1, description="smallest pixel-level weight, so that no pixel drifts freely"
-    )
-    image_confidence: bool = Field(
-        True, description="weight virtual views by U_img; without it all have the same, the mean"
-    )
-    light_cooldown_share: float = Field(
-        0.5,
-        ge=0,
-        lt=1,
-        description="on real views alone, the learning rates of the light fall in this last share of the "
-        "iterations; with virtual views, whose exposure is fixed, they do not. 0: never",
-    )
-    judge: JudgeConfig = JudgeConfig()
-    seed: Seed = Field(0, description="seed of all random sampling")
-
-    @model_validator(mode="after")
-    def _a_step_in_each_round(self) -> Self:
-        if self.rounds > self.iterations:
-            raise ValueError(f"{self.rounds} rounds of {self.iterations} iterations in all")
-        return self
-
-    @property
-    def steps_of_rounds(self) -> tuple[int, ...]:
-        """The iterations of each round: as even as they can be."""
-        ends = [round(self.iterations * (number + 1) / self.rounds) for number in range(self.rounds)]
-        return tuple(end - begin for begin, end in zip([0, *ends[:-1]], ends, strict=True))
-
-    @property
-    def growth_before_last(self) -> float:
-        """`growth` in all rounds but the last, which so has room for the holes that are left."""
-        return max(1.0, EARLIER_GROWTH_SHARE * self.growth)
-
-    @property
-    def first_round(self) -> FinetuneConfig:
-        """Settings of the first of the rounds alone."""
-        if self.rounds == 1:
-            return self
-        first = {"rounds": 1, "iterations": self.steps_of_rounds[0], "growth": self.growth_before_last}
-        return self.model_copy(update=first)
 
 
 LpipsNet = Literal["alex", "vgg", "squeeze"]

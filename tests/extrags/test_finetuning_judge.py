@@ -13,7 +13,7 @@ from extrags import finetuning_judge
 from extrags.cameras import Cameras
 from extrags.confidence import PerceptualDifference
 from extrags.config import CoarseConfig, DensifyConfig, EnhanceConfig, FinetuneConfig
-from extrags.config.stages import JudgeConfig
+from extrags.config.finetuning import JudgeConfig
 from extrags.finetuning_judge import AMOUNTS, Judgement, Trial, decide, judge_finetuning
 from extrags.restoration.benchmark.variants import AsRendered
 from extrags.restoration.classical import ClassicalEnhancer

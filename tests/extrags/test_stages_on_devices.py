@@ -22,7 +22,7 @@ from extrags.config import (
     PipelineConfig,
     SurfaceConfig,
 )
-from extrags.config.stages import JudgeConfig
+from extrags.config.finetuning import JudgeConfig
 from extrags.evaluation import evaluate_renders, render
 from extrags.exploration.coverage import training_coverage
 from extrags.finetuning_judge import judge_finetuning

@@ -15,7 +15,7 @@ import torch
 
 from extrags.confidence import PerceptualDifference
 from extrags.config import CoarseConfig, DensifyConfig, DepthConfig, EnhanceConfig, FinetuneConfig
-from extrags.config.stages import JudgeConfig
+from extrags.config.finetuning import JudgeConfig
 from extrags.depth.estimate import estimate_depth
 from extrags.finetuning_judge import judge_finetuning
 from extrags.metrics.lpips import Lpips
