@@ -39,6 +39,9 @@ demo: export EXTRAGS_LPIPS_WEIGHTS := $(EXTRAGS_LPIPS_WEIGHTS)
 demo: setup ## Reconstruct, explore, restore and evaluate the phantom, both settings
 	$(BIN)/extrags run phantom/0@sparse phantom/0@distanced --profile quick --store $(STORE)
 
+# Tests start many programs, each of which would compile the project anew.
+test test-slow: export PYTHONDONTWRITEBYTECODE :=
+
 test: setup ## The default test suite
 	$(BIN)/python -m pytest $(PARALLEL)
 

@@ -109,7 +109,7 @@ def test_assessment(few: Tube, elsewhere: torch.device, monkeypatch: pytest.Monk
 @pytest.mark.usefixtures("without_kernels")
 def test_the_judge(few: Tube, elsewhere: torch.device) -> None:
     config = FinetuneConfig(
-        iterations=4, judge=JudgeConfig(iterations_share=1.0, leave_out_every=3, max_width=24)
+        iterations=2, judge=JudgeConfig(iterations_share=1.0, leave_out_every=3, max_width=24)
     )
     expected, found = (
         judge_finetuning(few.scene.to(device), few.sequence, (), None, config, EnhanceConfig(), COARSE)
@@ -121,7 +121,7 @@ def test_the_judge(few: Tube, elsewhere: torch.device) -> None:
 
 @pytest.mark.usefixtures("without_kernels")
 def test_pairs_of_a_fold(few: Tube, elsewhere: torch.device) -> None:
-    config = EnhanceConfig(folds=2, fold_iterations=3, synthetic_views=2)
+    config = EnhanceConfig(folds=2, fold_iterations=2, synthetic_views=1)
     expected, found = (
         fold_pairs(few.scene.to(device), few.sequence, config, COARSE, 0) for device in ("cpu", elsewhere)
     )

@@ -114,6 +114,7 @@ class TestFocalLength:
         posed = with_estimated_poses(guessed(room), smaller)
         assert posed.rgb.shape == room.rgb.shape
 
+    @pytest.mark.slow
     def test_same_bits(self, found: PoseEstimate, room: EndoscopicSequence) -> None:
         again = estimate_poses(guessed(room), CONFIG)
         assert again.calibration == found.calibration

@@ -66,8 +66,15 @@ def check_same(found: TrainingResult, expected: TrainingResult, device: torch.de
 
 @pytest.mark.usefixtures("without_kernels")
 class TestCoarse:
-    @pytest.mark.parametrize("lit", [True, False], ids=["lit", "unlit"])
-    @pytest.mark.parametrize("strategy", ["default", "mcmc"])
+    @pytest.mark.parametrize(
+        ("strategy", "lit"),
+        [
+            pytest.param("default", True, id="default-lit"),
+            pytest.param("mcmc", False, id="mcmc-unlit"),
+            pytest.param("default", False, id="default-unlit", marks=pytest.mark.slow),
+            pytest.param("mcmc", True, id="mcmc-lit", marks=pytest.mark.slow),
+        ],
+    )
     def test_all_of_it_is_on_the_device(
         self,
         small: EndoscopicSequence,
@@ -136,8 +143,8 @@ class TestFinetuning:
         "settings",
         [
             {"loss": "weighted_mean"},
-            {"loss": "weighted_sum", "pseudo_depth": True},
-            {"loss": "paper"},
+            pytest.param({"loss": "weighted_sum", "pseudo_depth": True}, marks=pytest.mark.slow),
+            pytest.param({"loss": "paper"}, marks=pytest.mark.slow),
             {"keep_scene": True, "seed_holes": True},
         ],
         ids=["mean", "sum", "paper", "filling"],
