@@ -204,7 +204,6 @@ REGISTRY: tuple[Stage, ...] = (
             ),
             StageTask(
                 name="finetune",
-                several_loops=True,
                 cost=Cost(
                     terms=(
                         "train*pixels",

@@ -184,7 +184,11 @@ def _round(
     )
     # All harmonics are active from the first step: the scene is optimised already.
     schedule = replace(
-        schedule, photometric_weight=config.photometric_weight, light_cooldown_share=cooldown_share
+        schedule,
+        photometric_weight=config.photometric_weight,
+        light_cooldown_share=cooldown_share,
+        iterations_before=sum(config.steps_of_rounds[:number]),
+        iterations_after=sum(config.steps_of_rounds[number + 1 :]),
     ).resumed(seed=config.seed)
     if config.keep_scene:
         return optimise(

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from extrags.errors import DivergedError, NonFiniteError
-from extrags.events import Progress, emit
+from extrags.events import emit
 from extrags.gaussians import Gaussians
 from extrags.illumination import NearFieldLight
 from extrags.scene import Scene
@@ -116,7 +116,7 @@ def optimise(
                     "n_gaussians": float(len(adam.steps)),
                 }
                 history.append(entry)
-                emit(Progress(schedule.stage, iteration + 1, schedule.iterations, entry))
+                emit(schedule.progress(iteration, entry))
                 if not _nonfinite(adam.parameters, step.light):
                     last_good = Scene(Gaussians(**adam.parameters), step.light).detached()
     if _nonfinite(adam.parameters, step.light):

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, replace
 
 from extrags.config import DensifyConfig, LightConfig, OptimiserConfig
+from extrags.events import Progress
 from extrags.training.normal_term import NormalTerm
 
 __all__ = ["DECAY_EXPONENT", "LIGHT_COOLDOWN_FINAL", "Schedule"]
@@ -40,6 +41,17 @@ class Schedule:
     normals: NormalTerm | None = None
     light_cooldown_share: float = 0.0
     """Of the iterations, the last ones, in which the light's rates fall to `LIGHT_COOLDOWN_FINAL`."""
+    iterations_before: int = 0
+    """Of earlier rounds of the same stage: its progress counts them."""
+    iterations_after: int = 0
+    """The same of later rounds."""
+
+    def progress(self, iteration: int, values: dict[str, float]) -> Progress:
+        """How far the stage is after an iteration, all of its rounds counted."""
+        done = self.iterations_before + iteration + 1
+        return Progress(
+            self.stage, done, self.iterations_before + self.iterations + self.iterations_after, values
+        )
 
     def learning_rates(self, iteration: int) -> dict[str, float]:
         """Rates at an iteration: positions fall log-linearly, the others as `rate_share` says."""

@@ -15,6 +15,7 @@ import torch
 from pydantic import ValidationError
 
 from extrags.config import PROFILES, DensifyConfig, FinetuneConfig
+from extrags.events import Event, Progress, subscribed
 from extrags.pseudo_views import PseudoViews
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
@@ -83,6 +84,15 @@ class TestShownAgain:
 
 
 class TestRounds:
+    def test_progress_counts_all_of_them(
+        self, scene: Scene, sequence: EndoscopicSequence, pseudo: PseudoViews
+    ) -> None:
+        seen: list[Event] = []
+        with subscribed(seen.append):
+            finetune(scene, sequence, pseudo, config_of("weighted_mean", iterations=5, rounds=2), COARSE)
+        told = [(event.done, event.total) for event in seen if isinstance(event, Progress)]
+        assert told == [(1, 5), (2, 5), (3, 5), (5, 5)]
+
     def test_each_goes_on_from_the_one_before(
         self, scene: Scene, sequence: EndoscopicSequence, pseudo: PseudoViews, rounds: list[Run]
     ) -> None:
