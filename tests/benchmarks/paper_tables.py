@@ -1,4 +1,4 @@
-"""The tables of docs/results.md and of the pages beside it as Markdown, from results of `extrags benchmark --json`.
+"""Tables of docs/results.md and the pages beside it, as Markdown, from results of `extrags benchmark --json`.
 
 `python tests/benchmarks/paper_tables.py methods|ablation|budget FILE...` and `... judge STORE`
 
