@@ -68,9 +68,8 @@ def spoil_transforms(key: str) -> Callable[[Path, str], None]:
         write_transforms(small_sequence(), folder)
         edit(folder / "transforms.json", lambda content: content["frames"][1].update({key: name}))
         # The split names frames, too.
-        edit(
-            folder / "transforms.json", lambda content: content.update(test_filenames=[], train_filenames=[])
-        )
+        lists: dict[str, list[str]] = {f"{part}_filenames": [] for part in ("train", "test", "val")}
+        edit(folder / "transforms.json", lambda content: content.update(lists))
 
     return spoil
 

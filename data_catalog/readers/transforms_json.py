@@ -204,7 +204,8 @@ def write_transforms(
     """Write a posed sequence as `transforms.json` with its images, masks, depth and points.
 
     Numbers keep all their digits. Depth is written as float `.npy` in thousandths of the pose unit, which is
-    what nerfstudio expects; `length_unit` says what that unit is.
+    what nerfstudio expects; `length_unit` says what that unit is. Held-out frames are those of `test` and of
+    `val`; where there are none, no list is written.
 
     Args:
         sequence: with poses.
@@ -243,9 +244,11 @@ def write_transforms(
     }
     if sequence.lens is not None:
         content |= dict(zip(("k1", "k2", "k3", "k4"), sequence.lens.coefficients, strict=True))
-    for split, indices in (("train", sequence.train), ("test", sequence.test)):
-        content[f"{split}_filenames"] = [frames[int(index)]["file_path"] for index in indices]
-    content["val_filenames"] = []
+    if len(sequence.test):
+        # nerfstudio evaluates on `val` while it trains and on `test` afterwards, and fails where a list is
+        # empty; without any list it makes a split of its own.
+        for name, indices in (("train", sequence.train), ("val", sequence.test), ("test", sequence.test)):
+            content[f"{name}_filenames"] = [frames[int(index)]["file_path"] for index in indices]
     if points is not None:
         content["ply_file_path"] = "points.ply"
         _write_points(folder / "points.ply", points, points_rgb)

@@ -204,7 +204,7 @@ class TestOtherLayouts:
         for entry in content["frames"]:
             entry.pop("depth_file_path")
         left_out = content["frames"].pop()["file_path"]
-        content["test_filenames"], content["train_filenames"] = [], []
+        content |= {f"{part}_filenames": [] for part in ("train", "test", "val")}
         (tmp_path / "transforms.json").write_text(json.dumps(content))
         found = [finding.sentence.partition("is not read; ")[2] for finding in not_read(tmp_path)]
         assert found == [f"no frame names a file in it ({key})" for key in ("depth_file_path", "mask_path")]
@@ -219,7 +219,7 @@ class TestOtherLayouts:
         write_transforms(clip, tmp_path)
         content = json.loads((tmp_path / "transforms.json").read_text())
         content["frames"][3][key] = "./" + content["frames"][2][key]
-        content["test_filenames"], content["train_filenames"] = [], []
+        content |= {f"{part}_filenames": [] for part in ("train", "test", "val")}
         (tmp_path / "transforms.json").write_text(json.dumps(content))
         with pytest.raises(SourceError, match=f"field {key}: {problem}"):
             read(tmp_path)

@@ -73,6 +73,16 @@ class TestRoundTrip:
                 assert one[key] == other[key]
         assert first["test_filenames"] == second["test_filenames"]
 
+    def test_no_list_is_empty(self, clip, folder, tmp_path) -> None:
+        """nerfstudio cannot be given a list without frames."""
+        content = json.loads((folder / "transforms.json").read_text())
+        assert content["val_filenames"] == content["test_filenames"] == ["images/0000.png"]
+        assert len(content["train_filenames"]) == len(clip) - 1
+        every = replace(clip, split=Split("all", np.arange(len(clip)), np.arange(0)))
+        write_transforms(every, tmp_path / "every")
+        content = json.loads((tmp_path / "every" / "transforms.json").read_text())
+        assert not [key for key in content if key.endswith("_filenames")]
+
     def test_depth_carried_from_frame_to_frame(self, clip, folder) -> None:
         back = read(folder)
         assert carried_error_mm(back) == pytest.approx(carried_error_mm(clip), abs=1e-4)
@@ -220,7 +230,7 @@ class TestReading:
 
     def test_paths_without_suffix(self, folder, edit) -> None:
         def strip(content) -> None:
-            for key in ("train_filenames", "test_filenames"):
+            for key in ("train_filenames", "test_filenames", "val_filenames"):
                 content[key] = [name.removesuffix(".png") for name in content[key]]
             for entry in content["frames"]:
                 entry["file_path"] = entry["file_path"].removesuffix(".png")
@@ -248,6 +258,7 @@ class TestLists:
     def test_of_transforms(self, folder, edit, caplog, train, test, held_out, left_out) -> None:
         def lists(content) -> None:
             names = [entry["file_path"] for entry in content["frames"]]
+            content["val_filenames"] = []
             for key, chosen in (("train_filenames", train), ("test_filenames", test)):
                 content[key] = [] if chosen is None else [names[k] for k in chosen]
 
