@@ -9,7 +9,8 @@ Steps are 3 % of the width; they grow where there would be more frames than aske
 would be fewer than 24, down to what the flow can tell.
 
 Which shot is the longest is counted in seconds, by the timestamps of the frames, not by their number: where
-the frame rate varies, the two differ.
+the frame rate varies, the two differ. A shot ends one usual step after its last frame: a pause of the
+recorder that follows belongs to no shot.
 
 Source: sharpness as the mean absolute Laplacian over the mean brightness, after Pertuz et al., "Analysis of
 focus measure operators for shape-from-focus", Pattern Recognition 2013; flow: `extrags.dense_flow`.
@@ -55,7 +56,7 @@ class Shot:
     Args:
         first: position of the first.
         last: position of the last.
-        duration_s: by timestamps.
+        duration_s: by timestamps, up to the end of the last frame.
         motion: share of the width that the picture moves, in all.
         interlaced: whether its pictures are woven from two moments.
     """
@@ -75,7 +76,7 @@ class Survey:
         width: of a frame, in pixels.
         height: of a frame, in pixels.
         numbers: of the frames in the file, [F].
-        times_s: timestamps, [F].
+        times_s: timestamps, never falling, [F].
         path: share of the width that the picture has moved since the first frame, never falling, [F].
         sharpness: comparable between neighbouring frames, [F]; zero where a glitch interrupts a shot.
         shots: index of each frame's shot, never falling, [F].
@@ -114,7 +115,11 @@ class Survey:
 
     def _shot(self, first: int, last: int) -> Shot:
         here = slice(first, last + 1)
-        end_s = self.times_s[last + 1] if last + 1 < len(self) else self.times_s[last]
+        # Of a single frame the usual step of all.
+        steps = np.diff(self.times_s[here] if last > first else self.times_s)
+        end_s = self.times_s[last] + (float(np.median(steps)) if len(steps) else 0.0)
+        if last + 1 < len(self):
+            end_s = min(end_s, self.times_s[last + 1])
         return Shot(
             first=first,
             last=last,

@@ -8,10 +8,11 @@ assumed and said so until the poses stage estimates it, without the second the p
 text are found. How frames are chosen: `data_catalog.readers.footage_frames`.
 
 Frames are decoded by FFmpeg through PyAV: upright (a rotation in the container is applied), 8 bit a channel
-whatever the depth of the file, at the timestamps of the container, which may be uneven. Pixels that are not
-square (standard definition) stay as they are; the intrinsics say so. Colours of a file that does not name its
-matrix are BT.709 in high definition and BT.601 otherwise, as in players. OpenCV's own FFmpeg would not do: of
-every video whose header says that it is interlaced, OpenCV 5.0 gives empty pictures, without an error.
+whatever the depth of the file, at the timestamps of the container, which may be uneven. Where these go back,
+or jump by more than an hour, as where recordings were joined byte by byte, times count on. Pixels that are
+not square (standard definition) stay as they are; the intrinsics say so. Colours of a file that does not name
+its matrix are BT.709 in high definition and BT.601 otherwise, as in players. OpenCV's own FFmpeg would not
+do: of every video whose header says that it is interlaced, OpenCV 5.0 gives empty pictures, without an error.
 """
 
 from __future__ import annotations
@@ -53,6 +54,13 @@ _COUNTS_WHAT_IS_HIDDEN = "mp4"
 """Of the containers, this family alone: it counts frames that an edit list leaves out, as those between the
 last key frame and the beginning of a part that was cut out without coding it anew. Its durations are those of
 what is shown, and of a header that a truncated file has whole or not at all."""
+_TRANSPORT_STREAM, _ITS_PACKET_BYTES = "mpegts", 188
+"""In this container each frame begins a packet of its own."""
+_OUT_OF_ORDER_S = 0.5
+"""Timestamps that go back by less are those of frames out of order, and not of another recording."""
+_LONGEST_PAUSE_S = 3600.0
+"""Timestamps that jump by more are those of another clock: where those of a transport stream go back, FFmpeg
+takes them to have gone beyond their largest value, and adds 26.5 hours."""
 _CAMERAS = 2
 _UNSPECIFIED_COLOR = 2
 """What FFmpeg says of a matrix of colours that the file does not name."""
@@ -75,6 +83,7 @@ class VideoFile:
     def __init__(self, file: Path, *, named: Path | None = None) -> None:
         self._stream = file
         self._file = named or file
+        self._is_break_told = False
         with _opened(self._stream, self._file) as (container, stream):
             others = [other for other in container.streams.video if other != stream and not _is_cover(other)]
             if others:
@@ -95,6 +104,9 @@ class VideoFile:
             if _COUNTS_WHAT_IS_HIDDEN in container.format.name and stream.duration:
                 shown_s = float(stream.duration * stream.time_base)
                 self._announced = min(self._announced, round(shown_s * self._frames_per_s))
+            if container.format.name == _TRANSPORT_STREAM:
+                # Between joined recordings its duration may hold hours that nobody recorded.
+                self._announced = min(self._announced, file.stat().st_size // _ITS_PACKET_BYTES)
             aspect = float(stream.sample_aspect_ratio or 1)
             first = next(_decoded(container, stream), None)
             turned_deg = 0 if first is None else first.rotation
@@ -144,29 +156,38 @@ class VideoFile:
             SourceError: the video ends before its end.
         """
         last = None if numbers is None else max(numbers, default=-1)
-        count, time_s = 0, 0.0
+        count, clock = 0, _Clock(self._start_s, self._frames_per_s or _USUAL_FRAMES_PER_S)
         with _opened(self._stream, self._file) as (container, stream):
             for frame in _decoded(container, stream):
                 number, count = count, count + 1
-                time_s = self._time_s(number, frame.time)
+                time_s = clock.time_s(number, frame.time)
+                if clock.is_broken and not self._is_break_told:
+                    self._is_break_told = True
+                    logger.warning(
+                        "%s: the timestamps of frame %d do not go on from those before, as where recordings "
+                        "were joined; times (ingest.start_s, ingest.end_s) count on, frame by frame",
+                        self._file,
+                        number,
+                    )
                 if time_s >= span.end_s or (last is not None and number > last):
                     return
                 if time_s in span and (numbers is None or number in numbers):
                     rgb = np.rot90(_colors(frame), self._quarter_turns)
                     yield FootageFrame(number, time_s, np.ascontiguousarray(rgb))
         if numbers is None:
-            self._check_whole(count, time_s)
-
-    def _time_s(self, number: int, told_s: float | None) -> float:
-        """The container's timestamp; where it has none, frames follow evenly."""
-        if told_s is None:
-            return number / (self._frames_per_s or _USUAL_FRAMES_PER_S)
-        return told_s - self._start_s
+            self._check_whole(count, clock.farthest_s)
 
     def _check_whole(self, count: int, time_s: float) -> None:
         """Compare with the header, in frames and in seconds.
 
         Where the frame rate varies, the number of frames may be that of a steady rate.
+
+        Args:
+            count: of the frames that were decoded.
+            time_s: the last of their timestamps, as the container has them.
+
+        Raises:
+            SourceError: too few, and too early.
         """
         if count == 0 or count >= _MIN_DECODED * self._announced:
             return
@@ -178,6 +199,44 @@ class VideoFile:
                 file=self._file,
                 frame=count,
             )
+
+
+class _Clock:
+    """Times of frames that never fall, from timestamps of the container, which may.
+
+    Args:
+        start_s: timestamp of the beginning.
+        frames_per_s: at which frames follow that have no timestamp, or one of another clock.
+    """
+
+    def __init__(self, start_s: float, frames_per_s: float) -> None:
+        self._start_s = start_s
+        self._frames_per_s = frames_per_s
+        self._added_s = 0.0
+        self._last_s: float | None = None
+        self.is_broken = False
+        """Whether timestamps of another clock were met."""
+        self.farthest_s = 0.0
+        """The last time, by timestamps as they are."""
+
+    def time_s(self, number: int, told_s: float | None) -> float:
+        """When the next frame is shown.
+
+        Args:
+            number: of the frame.
+            told_s: its timestamp; where it has none, frames follow evenly.
+        """
+        plain_s = number / self._frames_per_s if told_s is None else told_s - self._start_s
+        self.farthest_s = max(self.farthest_s, plain_s)
+        time_s = plain_s + self._added_s
+        if self._last_s is not None:
+            if not -_OUT_OF_ORDER_S <= time_s - self._last_s <= _LONGEST_PAUSE_S:
+                self.is_broken = True
+                time_s = self._last_s + 1 / self._frames_per_s
+                self._added_s = time_s - plain_s
+            time_s = max(time_s, self._last_s)
+        self._last_s = time_s
+        return time_s
 
 
 def files_meant(place: Path, suffixes: tuple[str, ...]) -> tuple[Path, ...]:
@@ -284,7 +343,7 @@ def _footage(place: Path, config: IngestConfig) -> Footage:
 
 READER = FolderReader(
     name="video",
-    version=7,
+    version=8,
     summary="a video file (mp4, avi, mov, mkv, ...), optionally with intrinsics.json and mask.png beside it",
     recognises=_recognises,
     files=_files,

@@ -24,11 +24,12 @@ def write_video(file: Path, frames: np.ndarray, code: str = "FFV1") -> Path:
     return file
 
 
-def write_coded(file: Path, frames: np.ndarray, codec: str, **options: str) -> Path:
-    """In the container that the suffix says, by one of FFmpeg's encoders."""
+def write_coded(file: Path, frames: np.ndarray, codec: str, *, start_s: float = 0.0, **options: str) -> Path:
+    """In the container that the suffix says, by one of FFmpeg's encoders, from a time on."""
     import av
 
-    with av.open(str(file), "w") as container:
+    later = {"output_ts_offset": str(start_s)} if start_s else {}
+    with av.open(str(file), "w", container_options=later) as container:
         stream = container.add_stream(codec, rate=25, options={"b": "8000000", **options})
         stream.height, stream.width = frames.shape[1:3]
         stream.pix_fmt = "yuv420p"
