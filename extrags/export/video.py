@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
 
@@ -111,9 +112,10 @@ def write_video(
         ConfigError: without frames, or for a rate that is none.
         ShapeError: when sizes differ.
         StoreError: when the file cannot be written, or FFmpeg was built without H.264.
+
+    What `frames` raise comes through as it is.
     """
     import av
-    import av.error
     from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
 
     if not 0.1 <= fps <= 1000:
@@ -121,8 +123,10 @@ def write_video(
     rate = Fraction(fps).limit_denominator(1001)
     count = 0
     size: tuple[int, int] | None = None
+    with _told_of(file):
+        container = av.open(str(file), "w", format="mp4", options={"movflags": "+faststart"})
     try:
-        with av.open(str(file), "w", format="mp4", options={"movflags": "+faststart"}) as container:
+        with _told_of(file):
             stream = container.add_stream("libx264", rate=rate)
             stream.pix_fmt = "yuv420p"
             stream.codec_context.colorspace = Colorspace.ITU709
@@ -131,28 +135,41 @@ def write_video(
             stream.codec_context.color_trc = ColorTrc.BT709
             # x264's threads change nothing but the speed; one keeps a shared machine usable.
             stream.options = {"crf": quality, "preset": "medium", "threads": "1"}
-            for picture in frames:
-                if size is None:
-                    size = picture.shape[0], picture.shape[1]
-                    stream.width, stream.height = size[1] + size[1] % 2, size[0] + size[0] % 2
-                if picture.shape[:2] != size:
-                    raise ShapeError(f"frame {count} has size {picture.shape[:2]}, the first has {size}")
-                padded = np.pad(picture, ((0, size[0] % 2), (0, size[1] % 2), (0, 0)), mode="edge")
+        # What goes wrong while a frame is made says nothing about the file.
+        for picture in frames:
+            if size is None:
+                size = picture.shape[0], picture.shape[1]
+                stream.width, stream.height = size[1] + size[1] % 2, size[0] + size[0] % 2
+            if picture.shape[:2] != size:
+                raise ShapeError(f"frame {count} has size {picture.shape[:2]}, the first has {size}")
+            padded = np.pad(picture, ((0, size[0] % 2), (0, size[1] % 2), (0, 0)), mode="edge")
+            with _told_of(file):
                 coded = av.VideoFrame.from_ndarray(padded, format="rgb24").reformat(
                     format="yuv420p", dst_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.MPEG
                 )
                 for packet in stream.encode(coded):
                     container.mux(packet)
-                count += 1
-            if count == 0:
-                raise ConfigError("a video needs at least one frame")
+            count += 1
+        if count == 0:
+            raise ConfigError("a video needs at least one frame")
+        with _told_of(file):
             for packet in stream.encode(None):
                 container.mux(packet)
-    except (OSError, av.error.FFmpegError, ValueError) as error:
-        if isinstance(error, ConfigError | ShapeError):
-            raise
-        raise StoreError(f"{file} cannot be written as H.264: {error}") from error
+    finally:
+        with _told_of(file):
+            container.close()
     return count
+
+
+@contextmanager
+def _told_of(file: Path) -> Iterator[None]:
+    """What FFmpeg raises, as an error that names the file."""
+    from av.error import FFmpegError
+
+    try:
+        yield
+    except (OSError, FFmpegError, ValueError) as error:
+        raise StoreError(f"{file} cannot be written as H.264: {error}") from error
 
 
 def _colored(share: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:

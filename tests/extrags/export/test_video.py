@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from extrags.errors import ConfigError, ShapeError, StoreError
+from extrags.errors import ConfigError, ShapeError, SourceError, StoreError
 from extrags.export import fly_through, write_video
 from extrags.export.video import unobserved
 from extrags.scene import Scene
@@ -118,6 +118,16 @@ class TestRefused:
     def test_sizes_that_differ(self, tmp_path: Path) -> None:
         with pytest.raises(ShapeError, match="frame 1 has size"):
             write_video(iter([*flat(1), *flat(1, 32, 32)]), tmp_path / "a.mp4")
+
+    @pytest.mark.parametrize("error", [ValueError("no scene"), OSError("no disk"), SourceError("no frame")])
+    def test_what_goes_wrong_with_a_frame_is_not_the_file_s(self, error: Exception, tmp_path: Path) -> None:
+        def frames() -> Iterator[np.ndarray]:
+            yield from flat(2)
+            raise error
+
+        with pytest.raises(type(error)) as found:
+            write_video(frames(), tmp_path / "a.mp4")
+        assert found.value is error
 
     def test_a_folder_that_is_not_there(self, tmp_path: Path) -> None:
         with pytest.raises(StoreError, match=r"none/a\.mp4"):
