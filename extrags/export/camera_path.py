@@ -11,14 +11,16 @@ from typing import Any
 
 import numpy as np
 
-from extrags.cameras import Cameras, as_rotation
-from extrags.errors import ExtragsError, SourceError, SourceNotFoundError
+from extrags.cameras import Cameras
+from extrags.errors import PoseError, SourceError, SourceNotFoundError
+from extrags.sequence_checks import check_intrinsics, check_pose
 
 __all__ = ["CameraPath", "flight_through", "read_camera_path", "write_camera_path"]
 
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _PINHOLE = "perspective"
 """As the layout calls it; others are `fisheye` and `equirectangular`."""
+_WIDEST_FOV_DEG = 179.0
 _LARGEST_SIDE_PX = 8192
 _LARGEST_COUNT = 100_000
 
@@ -82,12 +84,14 @@ def read_camera_path(file: Path) -> CameraPath:
     Raises:
         SourceNotFoundError: when there is no such file.
         SourceError: when it is no camera path, its cameras are no pinholes (`camera_type` other than
-            perspective), or a number in it is wrong.
+            perspective), or a number in it is wrong; names the camera.
+        PoseError: when a matrix is no rigid motion.
     """
     if not file.is_file():
         raise SourceNotFoundError("no such file", file=file)
     try:
-        content = json.loads(file.read_text(encoding="utf-8"))
+        # Editors on Windows put a mark at the beginning.
+        content = json.loads(file.read_text(encoding="utf-8-sig"))
         width, height = int(content["render_width"]), int(content["render_height"])
         fps = float(content.get("fps", 24.0))
         kind = content.get("camera_type", _PINHOLE)
@@ -116,19 +120,27 @@ def read_camera_path(file: Path) -> CameraPath:
 def _camera(entry: Any, index: int, width: int, height: int, file: Path) -> tuple[np.ndarray, np.ndarray]:
     try:
         matrix = np.array(entry["camera_to_world"], dtype=np.float64).reshape(4, 4)
-        if "K" in entry:
-            K = np.array(entry["K"], dtype=np.float64).reshape(3, 3)
-        else:
-            focal = height / 2 / math.tan(math.radians(float(entry["fov"])) / 2)
-            K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
-        pose = matrix @ _OPENGL
-        pose[:3, :3] = as_rotation(pose[:3, :3], frame=index, file=file)
-    except ExtragsError:
-        raise
-    except (ValueError, KeyError, TypeError, OverflowError, ZeroDivisionError) as error:
+        given = np.array(entry["K"], dtype=np.float64).reshape(3, 3) if "K" in entry else None
+        fov_deg = float(entry["fov"]) if given is None else math.nan
+    except (ValueError, KeyError, TypeError, OverflowError) as error:
         raise SourceError(
             f"{type(error).__name__}: {error}", file=file, frame=index, field="camera_path"
         ) from error
-    if not (np.isfinite(pose).all() and np.isfinite(K).all() and K[0, 0] > 0 and K[1, 1] > 0):
-        raise SourceError("numbers that are no camera", file=file, frame=index, field="camera_path")
-    return K, pose
+    if given is None:
+        if not 0 < fov_deg < _WIDEST_FOV_DEG:
+            raise SourceError(
+                f"a field of view of {fov_deg:g} degrees; expected more than 0 and less than "
+                f"{_WIDEST_FOV_DEG:g}",
+                file=file,
+                frame=index,
+                field="fov",
+            )
+        focal = height / 2 / math.tan(math.radians(fov_deg) / 2)
+        K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+    else:
+        check_intrinsics(given, width, height, frame=index, file=file)
+        K = given
+    try:
+        return K, check_pose(matrix, frame=index, file=file) @ _OPENGL
+    except PoseError as error:
+        raise PoseError(error.problem, file=file, frame=index, field="camera_to_world") from error

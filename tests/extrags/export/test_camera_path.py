@@ -66,6 +66,12 @@ def test_a_path_of_another_program_has_no_intrinsics(tmp_path: Path) -> None:
     assert back.fps == 24.0
 
 
+def test_a_mark_of_an_editor_is_no_content(tmp_path: Path) -> None:
+    file, _ = written(tmp_path, tube_cameras(2))
+    file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes())
+    assert len(read_camera_path(file).cameras) == 2
+
+
 def test_a_flight_cuts_between_its_parts() -> None:
     first, second = tube_cameras(3), tube_cameras(2, start_mm=40.0)
     flight = flight_through([first, second], 4)
@@ -100,6 +106,30 @@ class TestRefused:
     def test_wrong_content(self, change: dict[str, Any], message: str, tmp_path: Path) -> None:
         file, content = written(tmp_path, tube_cameras(2))
         file.write_text(json.dumps({**content, **change}))
+        with pytest.raises(SourceError, match=message):
+            read_camera_path(file)
+
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            ({"fov": 180}, "frame 1, field fov: a field of view of 180 degrees"),
+            ({"fov": -20}, "frame 1, field fov"),
+            ({"fov": math.nan}, "frame 1, field fov"),
+            ({"K": [[60, 0, 32], [0, 60, 24], [0, 0, 7]]}, r"frame 1, field K: expected \[\[fx, 0, cx\]"),
+            ({"K": [[60, 5, 32], [0, 60, 24], [0, 0, 1]]}, "frame 1, field K"),
+            ({"K": [[-60, 0, 32], [0, 60, 24], [0, 0, 1]]}, "frame 1, field K: focal length fx = -60"),
+            ({"camera_to_world": [*np.eye(4)[:3].ravel(), 9, 9, 9, 9]}, "frame 1, field camera_to_world"),
+            ({"camera_to_world": (2 * np.eye(4)).ravel().tolist()}, "frame 1, field camera_to_world"),
+            ({"camera_to_world": [math.inf] * 16}, "frame 1, field camera_to_world"),
+        ],
+    )
+    def test_cameras_that_there_are_not(self, change: dict[str, Any], message: str, tmp_path: Path) -> None:
+        file, content = written(tmp_path, tube_cameras(2))
+        entry = content["camera_path"][1]
+        if "fov" in change:
+            del entry["K"]
+        entry.update(change)
+        file.write_text(json.dumps(content))
         with pytest.raises(SourceError, match=message):
             read_camera_path(file)
 
