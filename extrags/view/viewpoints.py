@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 from jaxtyping import Float
+from torch import Tensor
 
 from extrags.cameras import Cameras, look_at
 from extrags.errors import ConfigError
@@ -14,6 +15,8 @@ from extrags.scene import Scene
 __all__ = ["overview", "pinhole", "typical_depth"]
 
 _FOV_DEG = 60.0
+_SHOWN_DEVIATIONS = 2.0
+"""So many standard deviations of a Gaussian that stands alone are in view."""
 _SAMPLE = 20_000
 """So many Gaussians tell where a scene lies."""
 
@@ -53,7 +56,7 @@ def overview(scene: Scene, width: int) -> Cameras:
     Raises:
         ConfigError: for a scene without Gaussians.
     """
-    points = _sample(scene)
+    points = _sample(scene, scene.gaussians.means)
     if not len(points):
         raise ConfigError("the scene holds no Gaussians to look at")
     middle = np.median(points, axis=0)
@@ -62,6 +65,9 @@ def overview(scene: Scene, width: int) -> Cameras:
     distance = np.linalg.norm(offsets, axis=1)
     reach = max(float(np.quantile(distance, 0.75)), 1e-6)
     inner = offsets[distance <= 2 * reach]
+    # One Gaussian alone, or several at one place, reach as far as they are large.
+    size = float(np.median(np.exp(_sample(scene, scene.gaussians.scales).max(axis=1))))
+    reach = max(reach, _SHOWN_DEVIATIONS * size, 0.0 if scene.light is None else scene.near)
     axes = np.linalg.svd(inner, full_matrices=False)[2] if len(points) > 3 else np.eye(3)
     pose = look_at(middle - axes[2] * reach / math.tan(math.radians(_FOV_DEG / 2)) * 1.5, middle, axes[1])
     return pinhole(pose, math.radians(_FOV_DEG), 4 / 3, width)
@@ -74,11 +80,12 @@ def typical_depth(scene: Scene, camera: Cameras) -> float:
     """
     if scene.light is not None:
         return float(scene.light.reference_distance)
-    along = (_sample(scene) - camera.centers[0]) @ camera.forward[0]
+    along = (_sample(scene, scene.gaussians.means) - camera.centers[0]) @ camera.forward[0]
     ahead = along[along > 0]
     return float(np.median(ahead)) if len(ahead) else 1.0
 
 
-def _sample(scene: Scene) -> Float[np.ndarray, "n 3"]:
-    means = scene.gaussians.means.detach().cpu().numpy().astype(np.float64)
-    return np.asarray(means[:: max(1, len(means) // _SAMPLE)])
+def _sample(scene: Scene, values: Float[Tensor, "m 3"]) -> Float[np.ndarray, "n 3"]:
+    """Of the Gaussians that tell where a scene lies."""
+    every = values.detach().cpu().numpy()
+    return np.asarray(every[:: max(1, len(scene.gaussians) // _SAMPLE)].astype(np.float64))

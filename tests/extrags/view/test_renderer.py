@@ -232,6 +232,21 @@ class TestViewpoints:
         with pytest.raises(ConfigError, match="no Gaussians"):
             overview(Scene(few.gaussians.subset(torch.zeros(count, dtype=torch.bool))), 160)
 
+    @pytest.mark.parametrize("spread", [0.0, 1e-7])
+    @pytest.mark.parametrize("radius", [3.0, 1e-3])
+    @pytest.mark.parametrize("count", [1, 6])
+    def test_an_overview_of_gaussians_at_one_place_shows_them(
+        self, count: int, radius: float, spread: float
+    ) -> None:
+        points = 5 + spread * np.arange(3.0 * count).reshape(count, 3)
+        one = Scene(Gaussians.from_points(points, np.full((count, 3), 0.9), np.full(count, radius)))
+        opaque = Scene(replace(one.gaussians, opacities=torch.full((count,), 4.0)))
+        shown = SceneRenderer(opaque).render(overview(opaque, 48), ViewSettings(layer="alpha"))
+        # Round, in the middle, and neither a dot nor all there is.
+        assert shown[18, 24].min() > 200
+        assert shown[0, 0].max() < 40
+        assert 0.02 < (shown[..., 0] > 100).mean() < 0.6
+
     def test_typical_depths(self, scene: Scene, camera: Cameras) -> None:
         assert typical_depth(scene, camera) == 20.0
         unlit = typical_depth(Scene(scene.gaussians), camera)
