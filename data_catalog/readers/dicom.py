@@ -273,16 +273,32 @@ READER = FolderReader(
 
 
 def _times_s(header: Any, count: int, file: Path) -> Float[np.ndarray, "f"]:
-    """When each frame is shown."""
-    steps_ms = header.get("FrameTimeVector")
-    if steps_ms is not None and np.size(steps_ms) == count:
-        return np.cumsum(np.asarray(steps_ms, dtype=np.float64)) / 1000
-    rate = header.get("CineRate") or header.get("RecommendedDisplayFrameRate")
-    step_ms = header.get("FrameTime") or (1000 / float(rate) if rate else None)
-    if step_ms is None:
-        logger.info("%s: no timing, taken for %g frames a second", file.name, _USUAL_FRAMES_PER_S)
-        step_ms = 1000 / _USUAL_FRAMES_PER_S
-    return np.arange(count) * float(step_ms) / 1000
+    """When each frame is shown. An element that is 0 is as good as absent.
+
+    Raises:
+        SourceError: a duration or a rate that is none.
+    """
+    vector_ms = header.get("FrameTimeVector")
+    if vector_ms is not None and np.size(vector_ms) == count:
+        steps_ms = np.asarray(vector_ms, dtype=np.float64)
+        wrong = np.flatnonzero(~((steps_ms >= 0) & np.isfinite(steps_ms)))
+        if wrong.size:
+            raise SourceError(
+                f"{steps_ms[wrong[0]]:g} ms since the frame before; expected 0 or more",
+                file=file,
+                frame=int(wrong[0]),
+                field="FrameTimeVector",
+            )
+        return np.cumsum(steps_ms) / 1000
+    for name in ("FrameTime", "CineRate", "RecommendedDisplayFrameRate"):
+        value = float(header.get(name) or 0)
+        if not 0 <= value < np.inf:
+            unit = "ms for a frame" if name == "FrameTime" else "frames a second"
+            raise SourceError(f"{value:g} {unit}; expected a positive number", file=file, field=name)
+        if value:
+            return np.arange(count) * (value if name == "FrameTime" else 1000 / value) / 1000
+    logger.info("%s: no timing, taken for %g frames a second", file.name, _USUAL_FRAMES_PER_S)
+    return np.arange(count) / _USUAL_FRAMES_PER_S
 
 
 def _pixel_aspect(header: Any) -> float:

@@ -67,6 +67,7 @@ class TestPixels:
         [
             ({"FrameTime": 50}, 0.55),
             ({"CineRate": 10}, 1.1),
+            ({"FrameTime": 0, "CineRate": 10}, 1.1),
             ({"RecommendedDisplayFrameRate": 20}, 0.55),
             ({"FrameTimeVector": [0, *([100] * 10), 2000]}, 3.0),
             ({}, 0.44),
@@ -145,6 +146,22 @@ class TestRefused:
         file.write_bytes(file.read_bytes()[: int(share * file.stat().st_size)])
         with pytest.raises(SourceError, match=r"a\.dcm"):
             read(file)
+
+    @pytest.mark.parametrize(
+        ("elements", "message"),
+        [
+            ({"FrameTime": -40}, "field FrameTime: -40 ms for a frame; expected a positive number"),
+            ({"CineRate": -25}, "field CineRate: -25 frames a second"),
+            (
+                {"FrameTimeVector": [0, *([40] * 10), -2000]},
+                "frame 11, field FrameTimeVector: -2000 ms since",
+            ),
+        ],
+    )
+    def test_times_that_go_back(self, scene, tmp_path, elements, message) -> None:
+        file = write_dicom(tmp_path / "a.dcm", scene, **elements)
+        with pytest.raises(SourceError, match=rf"a\.dcm, {message}"):
+            open_dicom(file)
 
     def test_no_dicom_file(self, tmp_path) -> None:
         file = tmp_path / "a.dcm"
