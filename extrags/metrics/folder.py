@@ -4,7 +4,7 @@ The images show the held-out frames of a sequence. They are matched by name (`b_
 `b_0010`) if every file name is that of a frame; otherwise by number: as many files as held-out frames, sorted
 by the numbers in their names, for the frames in the order of the split. Frames named with their folders may
 stand in folders of these names (`left/0010.png`), and must where held-out frames of different folders share a
-name.
+name. Files and folders whose names begin with a dot are none of them.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def _files_of(
     in_folders = _files_at(paths, folder, suffixes)
     if in_folders:
         return _named(paths, _by_name(in_folders, kind), folder, sequence, kind)
-    files = sorted(file for file in folder.iterdir() if file.suffix.lower() in suffixes and file.is_file())
+    files = sorted(file for file in folder.iterdir() if _is_meant(file, folder, suffixes))
     if not files:
         kinds = ", ".join(sorted(suffixes))
         raise SourceNotFoundError(f"the folder holds no {kind} ({kinds})", file=folder)
@@ -140,9 +140,15 @@ def _files_at(paths: list[str], folder: Path, suffixes: frozenset[str]) -> dict[
     if not wanted:
         return {}
     # Looked for among what is there: joined to the folder, a frame's absolute path would lead out of it.
-    files = (file for file in sorted(folder.rglob("*")) if file.suffix.lower() in suffixes and file.is_file())
+    files = (file for file in sorted(folder.rglob("*")) if _is_meant(file, folder, suffixes))
     places = {file: file.relative_to(folder).with_suffix("").as_posix() for file in files}
     return {file: place for file, place in places.items() if place in wanted}
+
+
+def _is_meant(file: Path, folder: Path, suffixes: frozenset[str]) -> bool:
+    """Whether a file below a folder is one of its images: not one that macOS has put beside each."""
+    hidden = any(part.startswith(".") for part in file.relative_to(folder).parts)
+    return not hidden and file.suffix.lower() in suffixes and file.is_file()
 
 
 def _by_name(names: dict[Path, str], kind: str) -> dict[str, Path]:

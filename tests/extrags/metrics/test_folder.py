@@ -48,6 +48,20 @@ def test_names_decide_whatever_the_order(sequence: EndoscopicSequence, tmp_path:
     assert renders.n_gaussians is None
 
 
+def test_hidden_files_are_none_of_them(sequence: EndoscopicSequence, tmp_path: Path) -> None:
+    """macOS writes `._NAME` beside each file on drives of others, which is no image."""
+    names = ("left/0", "left/1", "left/2", "left/3", "left/4")
+    in_folders = replace(sequence, frame_names=names)
+    folder = write(tmp_path / "renders", {f"b_{index:04d}.png": LEVELS[index] for index in TEST})
+    write(folder / "left", {f"{index}.png": LEVELS[index] for index in TEST})
+    for index in TEST:
+        (folder / f"._b_{index:04d}.png").write_bytes(b"\0")
+        (folder / "left" / f"._{index}.png").write_bytes(b"\0")
+    write(folder / ".trash", {"b_0009.png": LEVELS[0]})
+    for given in (sequence, in_folders):
+        np.testing.assert_array_equal(np.rint(read_renders(folder, given).rgb * 255), LEVELS[TEST])
+
+
 def test_frames_named_like_files(sequence: EndoscopicSequence, tmp_path: Path) -> None:
     named = replace(sequence, frame_names=tuple(f"rgb/b_{index:04d}.png" for index in range(FRAMES)))
     folder = write(tmp_path / "renders", {f"b_{index:04d}.png": LEVELS[index] for index in TEST})
