@@ -298,7 +298,8 @@ def _binary_points(
 
 def _lines(file: Path) -> Iterator[tuple[int, str]]:
     try:
-        text = file.read_text(encoding="utf-8")
+        # Editors on Windows put a mark at the beginning.
+        text = file.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
         raise SourceError(f"not a text file: {error}", file=file) from error
     for number, line in enumerate(text.splitlines(), start=1):

@@ -90,7 +90,7 @@ def _image_count(folder: Path) -> int:
     if file.is_file():
         with file.open("rb") as stream:
             return int.from_bytes(stream.read(8), "little")
-    lines = (folder / "images.txt").read_text(errors="replace").splitlines()
+    lines = (folder / "images.txt").read_text(encoding="utf-8-sig", errors="replace").splitlines()
     return sum(not line.startswith("#") for line in lines) // 2
 
 

@@ -308,6 +308,16 @@ class TestTextFiles:
         np.testing.assert_array_equal(found.train, expected.train)
         np.testing.assert_array_equal(found.test, expected.test)
 
+    def test_a_mark_in_the_model_itself(self, clip, tmp_path) -> None:
+        write_colmap(clip, tmp_path / "scene", binary=False)
+        expected = read(tmp_path / "scene")
+        for file in (tmp_path / "scene" / "sparse" / "0").glob("*.txt"):
+            file.write_text("\ufeff" + file.read_text(), encoding="utf-8")
+        found = read(tmp_path / "scene")
+        np.testing.assert_array_equal(found.world_from_camera, expected.world_from_camera)
+        np.testing.assert_array_equal(found.K, expected.K)
+        np.testing.assert_array_equal(found.points, expected.points)
+
     def test_a_blank_may_belong_to_a_name(self, clip, tmp_path) -> None:
         write_colmap(clip, tmp_path / "scene")
         rename_images(tmp_path / "scene", lambda name: f"{name} ")
