@@ -19,7 +19,7 @@ from data_catalog.folder_reader import FolderReader
 from data_catalog.folders import find_reader
 from data_catalog.specular import specular_masks
 from extrags.config import IngestConfig
-from extrags.errors import ConfigError, ExtragsError, SourceError, UnknownSequenceError
+from extrags.errors import ExtragsError, SourceError, UnknownSequenceError
 from extrags.frame_quantiles import quantile_of_frames
 from extrags.observed_surface import never_observed
 from extrags.sequence import EndoscopicSequence, saturated_mask
@@ -61,13 +61,13 @@ def inspect(name_or_path: str | Path, config: IngestConfig | None = None) -> Ins
 
     Raises:
         UnknownSequenceError: neither a known name nor an existing path.
-        ConfigError: settings that this source cannot be read with.
     """
     source: Source | None = None
     reader: FolderReader | None = None
     sequence: EndoscopicSequence | None = None
     conventions = ""
     notes: tuple[str, ...] = ()
+    refused: ExtragsError | None = None
     with _HeardWarnings() as heard:
         try:
             source = resolve(name_or_path)
@@ -76,10 +76,12 @@ def inspect(name_or_path: str | Path, config: IngestConfig | None = None) -> Ins
             if reader is not None and reader.notes is not None:
                 notes = reader.notes(Path(str(source.path)))
             sequence = read(source, config)
-        except (UnknownSequenceError, ConfigError):
+        except UnknownSequenceError:
             raise
         except ExtragsError as error:
-            findings = [_as_finding(error)]
+            refused = error
+    place = str(name_or_path) if source is None else source.path or source.name
+    findings = [] if refused is None else [_as_finding(refused, place)]
     if sequence is not None and source is not None:
         # Of footage the reader itself chooses frames.
         chosen = reader is not None and reader.is_footage
@@ -89,7 +91,6 @@ def inspect(name_or_path: str | Path, config: IngestConfig | None = None) -> Ins
         found = diagnose(sequence, source.path or source.name, thinned=thinned)
         findings = [item for item in found if item.topic not in said]
     # Also where reading then failed: what it has warned of may be why.
-    place = str(name_or_path) if source is None else source.path or source.name
     findings += [item.model_copy(update={"file": place}) for item in heard.findings]
     return Inspection(
         name=source.name if source is not None else str(name_or_path),
@@ -203,17 +204,18 @@ def contact_sheet(sequence: EndoscopicSequence) -> UInt8[np.ndarray, "h w 3"]:
     return np.asarray(np.vstack(rows), dtype=np.uint8)
 
 
-def _as_finding(error: ExtragsError) -> Finding:
+def _as_finding(error: ExtragsError, place: str) -> Finding:
+    """Why a source cannot be read; settings, which name no file, are wrong for this one."""
     if isinstance(error, SourceError):
         return Finding(
             kind="error",
             topic="cannot be read",
             sentence=error.problem,
-            file=error.file,
+            file=error.file or place,
             frame=error.frame,
             field=error.field,
         )
-    return Finding(kind="error", topic="cannot be read", sentence=str(error))
+    return Finding(kind="error", topic="cannot be read", sentence=str(error), file=place)
 
 
 class _HeardWarnings(logging.Handler):

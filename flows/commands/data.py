@@ -137,7 +137,11 @@ def show(given: argparse.Namespace) -> int:
 
 
 def check(given: argparse.Namespace) -> int:
-    """`extrags data check`; exit code 1 when anything is wrong."""
+    """`extrags data check`; exit code 1 when anything is wrong.
+
+    Raises:
+        UnknownSequenceError: names that are not known, once what was found in the other sources is said.
+    """
     if given.debug:
         set_up_logging(debug=True, terminal=True)
     from rich.markup import escape
@@ -145,7 +149,13 @@ def check(given: argparse.Namespace) -> int:
     from data_catalog.inspection import inspect
     from flows.terminal import console
 
-    inspections = [inspect(name, _ingest(given)) for name in given.sources]
+    config = _ingest(given)
+    inspections, unknown = [], []
+    for name in given.sources:
+        try:
+            inspections.append(inspect(name, config))
+        except UnknownSequenceError as error:
+            unknown.append(str(error))
     if given.json != "-":
         out = console()
         for found in inspections:
@@ -167,6 +177,8 @@ def check(given: argparse.Namespace) -> int:
                 told = ", ".join(f"{name.removesuffix('_share')} {found.facts[name]:.1%}" for name in shares)
                 out.print(f"  {counted(found.facts['frames'], 'frame')}; pixels {told}")
     write_json([{"ok": found.ok, **found.model_dump(mode="json")} for found in inspections], given.json)
+    if unknown:
+        raise UnknownSequenceError("\n".join(unknown))
     return 0 if all(found.ok for found in inspections) else 1
 
 

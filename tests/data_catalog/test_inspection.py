@@ -35,6 +35,15 @@ class TestRightSources:
         assert inspection.conventions
         assert inspection.facts is not None
 
+    def test_settings_that_do_not_fit_are_findings_of_the_source(self, posed_folder) -> None:
+        found = inspect(posed_folder, IngestConfig(downscale=16))
+        (finding,) = found.findings
+        assert (finding.kind, finding.topic) == ("error", "cannot be read")
+        assert finding.file == str(posed_folder)
+        assert "pixels is too small" in finding.sentence
+        assert found.facts is None
+        assert found.format == "extrags"
+
     def test_unknown_names_are_not_findings(self) -> None:
         with pytest.raises(UnknownSequenceError):
             inspect("phantm/1")

@@ -135,6 +135,23 @@ class TestCheck:
         assert finding["file"].endswith("poses.json")
         assert "not readable as JSON" in finding["sentence"]
 
+    def test_one_that_cannot_be_read_hides_no_other(
+        self, scene: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        """Settings may be wrong for one source alone, and names may be misspelt."""
+        for number in range(4):
+            Image.new("RGB", (40, 32), (200, 90, 60)).save(tmp_path / f"{number}.png")
+        given = [str(tmp_path), "phantm/1@sparse", scene, "nothing/here"]
+        assert main(["data", "check", *given, "--json", "-", *SMALL]) == 2
+        said = capsys.readouterr()
+        small, right = json.loads(said.out)
+        (finding,) = small["findings"]
+        assert finding["file"] == str(tmp_path)
+        assert "is larger than the source's 40 x 32" in finding["sentence"]
+        assert right["facts"]["width"] == 48
+        assert "phantm/1@sparse" in said.err
+        assert "nothing/here" in said.err
+
     def test_unknown_name_is_wrong_usage(self, capsys: pytest.CaptureFixture[str]) -> None:
         assert main(["data", "check", "phantm/1@sparse"]) == 2
         assert "Did you mean" in capsys.readouterr().err
