@@ -386,7 +386,8 @@ def _depth(sequence: EndoscopicSequence) -> Iterator[Finding]:
     largest = max(depth.max() for depth in depths)
     known = sum(int((depth > 0).sum()) for depth in depths)
     share = sum(int((depth == largest).sum()) for depth in depths) / max(1, known)
-    steps = np.unique(sequence.depth_mm[0])
+    first = next((index for index, depth in enumerate(depths) if depth.any()), 0)
+    steps = np.unique(depths[first])
     if share > _CLIPPED_SHARE and len(steps) > 32:
         yield warning(
             "depth clipped",
@@ -397,9 +398,9 @@ def _depth(sequence: EndoscopicSequence) -> Iterator[Finding]:
     elif len(steps) <= 32:
         yield warning(
             "depth resolution",
-            f"the first frame has {len(steps)} different depths; expected a continuous map. Was it stored in "
+            f"the frame has {len(steps)} different depths; expected a continuous map. Was it stored in "
             "8 bits or as a picture?",
-            frame=sequence.frame_name(0),
+            frame=sequence.frame_name(first),
             field="depth_mm",
         )
     shares = np.array(

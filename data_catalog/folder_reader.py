@@ -172,7 +172,7 @@ class FolderReader:
             train=len(split.train),
             test=len(split.test),
             has_poses=world_from_camera is not None,
-            has_depth=kept[0].depth_file is not None,
+            has_depth=any(frame.depth_file is not None for frame in kept),
         )
 
     def fingerprint(self, place: Path) -> dict[str, Any]:

@@ -65,7 +65,7 @@ class PosedFrame:
         lens: for the image as it lies on disk.
         world_from_camera: as read; checked by `assembled`. None where the poses stage has to find it.
         mask_file: None where there is none.
-        depth_file: None where there is none.
+        depth_file: None where there is none; its depth is unknown.
         recording: index of the recording.
         split: None where the format names none.
         number: names the frame in messages where a source counts its frames; None takes the name.
@@ -180,7 +180,7 @@ def assembled(source: SourceFrames, config: IngestConfig, name: str) -> Endoscop
         ConfigError: a size that the source cannot give.
     """
     kept, split, world_from_camera = chosen_frames(source, config)
-    pixels = _Pixels(source, config, len(kept))
+    pixels = _Pixels(source, config, kept)
     for index, frame in enumerate(kept, start=source.looked_at + 1):
         pixels.read(frame)
         emit(Progress("ingest", index, source.looked_at + len(kept)))
@@ -234,7 +234,7 @@ def chosen_frames(
         config: number of frames, and the split of sources that name none.
 
     Raises:
-        SourceError: no frame or a single one, or depth, poses or a split for some frames alone.
+        SourceError: no frame or a single one, or poses or a split for some frames alone.
         PoseError: a pose that is no rigid motion.
         ConfigError: the right camera is asked for, and nothing tells of two.
     """
@@ -242,8 +242,7 @@ def chosen_frames(
         check_one_camera(config, str(source.pose_file))
     if not source.frames:
         raise SourceError("there is no frame", file=source.pose_file, field="frames")
-    _check_for_all_or_none(source, "depth", [frame.depth_file for frame in source.frames])
-    _check_for_all_or_none(source, "world_from_camera", [frame.world_from_camera for frame in source.frames])
+    _check_poses_of_all_or_none(source)
     kept = [source.frames[index] for index in spread(len(source.frames), config.max_frames)]
     return kept, _split(kept, source, config), _poses(kept, source)
 
@@ -273,7 +272,9 @@ def planned_sampling(
 class _Pixels:
     """Images, masks and depth of the frames that are kept, brought to the sequence's pinhole."""
 
-    def __init__(self, source: SourceFrames, config: IngestConfig, count: int) -> None:
+    def __init__(self, source: SourceFrames, config: IngestConfig, frames: Sequence[PosedFrame]) -> None:
+        count = len(frames)
+        self._has_depth = any(frame.depth_file is not None for frame in frames)
         self.source = source
         self.config = config
         self.samplings: dict[CameraModel, Sampling] = {}
@@ -313,6 +314,9 @@ class _Pixels:
             _check_size(depth, frame, frame.depth_file, "depth", None)
             self._depth_steps.see(depth, frame.depth_file)
             self.depths.append(sampling.depth(depth, file=frame.depth_file, frame=frame.label))
+        elif self._has_depth:
+            self._unknown_depth.see_absent(frame.label)
+            self.depths.append(np.zeros((sampling.height, sampling.width), dtype=np.float32))
 
     def tell(self, frames: Sequence[PosedFrame]) -> None:
         """Say what reading found out about the frames as a whole.
@@ -333,7 +337,7 @@ class _Pixels:
                 frame=frames[0].label,
                 field="rgb",
             )
-        self._unknown_depth.tell(len(frames))
+        self._unknown_depth.tell(len(frames), self.source.pose_file)
         if self._use is not None:
             self._use.tell()
 
@@ -401,16 +405,16 @@ def _tell_about_orientation(frames: Sequence[PosedFrame]) -> None:
         )
 
 
-def _check_for_all_or_none(source: SourceFrames, field: str, values: Sequence[object]) -> None:
-    there = sum(value is not None for value in values)
-    if there and there != len(values):
-        lacking = next(k for k, value in enumerate(values) if value is None)
+def _check_poses_of_all_or_none(source: SourceFrames) -> None:
+    without = [frame for frame in source.frames if frame.world_from_camera is None]
+    if 0 < len(without) < len(source.frames):
+        there = len(source.frames) - len(without)
         raise SourceError(
-            f"no {field} for this frame, but for {there} of {len(values)}; "
-            "expected it for all frames or for none",
+            f"no world_from_camera for this frame, but for {there} of {len(source.frames)}; expected it for "
+            "all frames or for none",
             file=source.pose_file,
-            frame=source.frames[lacking].label,
-            field=field,
+            frame=without[0].label,
+            field="world_from_camera",
         )
 
 

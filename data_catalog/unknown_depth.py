@@ -21,6 +21,7 @@ class UnknownDepth:
     def __init__(self) -> None:
         self._unfinite: dict[Path, int] = {}
         self._background: dict[Path, int] = {}
+        self._absent: list[str | int] = []
 
     def zeroed(self, depth: Float[np.ndarray, "h w"], file: Path) -> Float[np.ndarray, "h w"]:
         """A map with 0 where it is not finite, or a background.
@@ -39,12 +40,26 @@ class UnknownDepth:
             depth = np.where(background, np.float32(0), depth)
         return depth
 
-    def tell(self, frames: int) -> None:
-        """Warn of what was found in all maps.
+    def see_absent(self, frame: str | int) -> None:
+        """Take note of a frame that has no map, where others have one."""
+        self._absent.append(frame)
+
+    def tell(self, frames: int, listing: Path) -> None:
+        """Warn of what was found in all maps, and of frames that have none.
 
         Args:
             frames: how many there are.
+            listing: the file that lists them.
         """
+        if self._absent:
+            logger.warning(
+                "%s: %d of %d frames, %s first, have no depth, which is taken as unknown",
+                listing,
+                len(self._absent),
+                frames,
+                self._absent[0],
+                extra={"topic": "depth coverage", "field": "depth"},
+            )
         for counted, what in (
             (self._unfinite, "are NaN or infinite"),
             (self._background, f"are over {FARTHEST:g} times as far away as what is near in their image"),

@@ -29,12 +29,12 @@ Camera axes are OpenCV's (x right, y down, z forward), matrices map camera to wo
 pixels of the files with pixel centres at +0.5. Every image in `rgb/` needs an entry, every entry an image.
 Numbers of depth files are lengths as they are: a level of integers, as in a PNG, is one whole unit, which is
 coarse beside the few centimetres that an endoscope sees.
-Depth is looked for as `depth/<name>.npy|.tiff|.tif|.png`, for all frames or for none, and masks as
-`mask/<name>` with the suffix of any image, in upper or lower case; <name> is the path below `rgb/`, else its
-last part, without suffix. No two frames share a file. Frames without a mask are tissue throughout, which the
-log says. A frame's `file` may be absolute, or go through `..`, where it leads to a file below the folder.
-Frames without `split` are split by holding out every n-th. Nothing is turned or scaled; where depth shows
-that the poses are in other axes, the sequence is refused and the axes that fit are named.
+Depth is looked for as `depth/<name>.npy|.tiff|.tif|.png`, and masks as `mask/<name>` with the suffix of any
+image, in upper or lower case; <name> is the path below `rgb/`, else its last part, without suffix. No two
+frames share a file. Frames without a mask are tissue throughout, and depth of frames without a file is
+unknown, which the log says. A frame's `file` may be absolute, or go through `..`, where it leads to a file
+below the folder. Frames without `split` are split by holding out every n-th. Nothing is turned or scaled;
+where depth shows that the poses are in other axes, the sequence is refused and the axes that fit are named.
 """
 
 from __future__ import annotations
@@ -225,12 +225,14 @@ def _depth_files(folder: Path, names: list[str]) -> list[Path | None]:
                     frame=name,
                     field="depth",
                 )
-            raise SourceNotFoundError(
-                "no depth for this frame; expected it for all frames, or no folder depth/ at all",
-                file=folder / "depth" / f"{Path(name).stem}{DEPTH_SUFFIXES[0]}",
-                frame=name,
-                field="depth",
-            )
+    if names and not any(found):
+        raise SourceNotFoundError(
+            "no depth for this frame, nor for any other; expected files named after frames, or no folder "
+            "depth/ at all",
+            file=folder / "depth" / f"{Path(names[0]).stem}{DEPTH_SUFFIXES[0]}",
+            frame=names[0],
+            field="depth",
+        )
     return found
 
 

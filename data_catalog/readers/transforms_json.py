@@ -4,11 +4,11 @@ Read: `transform_matrix` (camera to world, OpenGL axes: y up, z backward; turned
 nothing else), `fl_x`, `fl_y` or `camera_angle_x`, `camera_angle_y`, `cx`, `cy`, `w`, `h`, `k1` to `k4`, `p1`,
 `p2`, `camera_model` or `is_fisheye`, each for all frames or in a frame of its own; `file_path` (its suffix
 may be missing; frames without a file are left out, with a warning), `mask_path` (white is tissue),
-`depth_file_path`; `train_filenames`, `test_filenames` and `val_filenames` (frames in none of them are left
-out); `ply_file_path` (points that are not finite are left out, with a warning). A `null` is as good as no
-value. Other keys are passed over; a warning names those that look misspelt or tell of distortion. Images of
-distorted cameras are resampled to a pinhole; a term of distortion that the camera's model has not is refused,
-unless it is 0.
+`depth_file_path` (of frames without one, or whose file is absent, depth is unknown, with a warning);
+`train_filenames`, `test_filenames` and `val_filenames` (frames in none of them are left out); `ply_file_path`
+(points that are not finite are left out, with a warning). A `null` is as good as no value. Other keys are
+passed over; a warning names those that look misspelt or tell of distortion. Images of distorted cameras are
+resampled to a pinhole; a term of distortion that the camera's model has not is refused, unless it is 0.
 
 Depth is z-depth; a value times `depth_unit_scale_factor` is in the unit of the poses. Where the file does not
 say, that is nerfstudio's 0.001 (or, for integers, instant-ngp's `integer_depth_scale`). 0 is unknown.
@@ -139,6 +139,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     used = present & splits.keys() if splits else present
     entries = [entry for entry in listed if entry["file_path"] in used]
     folders = sorted({str(Path(entry["file_path"]).parent) for entry in entries}, key=natural_key)
+    depth_files = _depth_files(folder, entries)
     frames = []
     for entry in entries:
         frame = entry["file_path"]
@@ -149,8 +150,8 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
                 file=place,
                 lens=_lens({**content, **entry}, place, file, frame),
                 world_from_camera=_pose(entry, scale, file, frame),
-                mask_file=_beside(folder, entry, "mask_path", frame),
-                depth_file=_beside(folder, entry, "depth_file_path", frame),
+                mask_file=_mask_file(folder, entry, frame),
+                depth_file=depth_files[frame],
                 recording=folders.index(str(Path(frame).parent)),
                 split=splits.get(frame),
             )
@@ -292,13 +293,33 @@ def _tell_about_unlisted(file: Path, frames: list[PosedFrame], listed: Collectio
         )
 
 
-def _beside(folder: Path, entry: dict[str, Any], key: str, frame: str) -> Path | None:
+def _beside(folder: Path, entry: dict[str, Any], key: str) -> Path | None:
+    """The file that a frame names, which may be absent; None where it names none."""
     if key not in entry:
         return None
-    file = inside(folder, str(entry[key]), file=folder / TRANSFORMS_FILE, frame=frame, field=key)
-    if not file.is_file():
-        raise SourceNotFoundError("no such file", file=file, frame=frame, field=key)
+    return inside(folder, str(entry[key]), file=folder / TRANSFORMS_FILE, frame=entry["file_path"], field=key)
+
+
+def _mask_file(folder: Path, entry: dict[str, Any], frame: str) -> Path | None:
+    file = _beside(folder, entry, "mask_path")
+    if file is not None and not file.is_file():
+        raise SourceNotFoundError("no such file", file=file, frame=frame, field="mask_path")
     return file
+
+
+def _depth_files(folder: Path, entries: list[dict[str, Any]]) -> dict[str, Path | None]:
+    """Depth of each frame, by its `file_path`; None where it names none, or one that is absent.
+
+    Raises:
+        SourceNotFoundError: all that are named are absent.
+    """
+    named = {entry["file_path"]: _beside(folder, entry, "depth_file_path") for entry in entries}
+    found = {frame: file if file is not None and file.is_file() else None for frame, file in named.items()}
+    if not any(found.values()):
+        for frame, file in named.items():
+            if file is not None:
+                raise SourceNotFoundError("no such file", file=file, frame=frame, field="depth_file_path")
+    return found
 
 
 def _pose(entry: dict[str, Any], scale: float, file: Path, frame: str) -> Float[np.ndarray, "4 4"]:
