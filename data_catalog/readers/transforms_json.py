@@ -37,7 +37,6 @@ from data_catalog.images import (
     COLOR_SUFFIXES,
     file_key,
     image_entries,
-    image_size,
     natural_key,
     order_for_fingerprint,
     read_depth,
@@ -47,11 +46,11 @@ from data_catalog.inside import inside
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from data_catalog.readers.beside_frames import frames_among, listed_files, tell_about_folders
 from data_catalog.readers.frame_list import listed_split, load_frame_list, matrix_of, present_frames
+from data_catalog.readers.transforms_lens import DISTORTION_KEYS, StatedLens
 from data_catalog.readers.unknown_keys import warn_of_unknown_keys
 from extrags.array_files import load_ply_vertices
 from extrags.config import IngestConfig
 from extrags.errors import PoseError, SourceError, SourceNotFoundError
-from extrags.lens import LENS_PARAMETERS, Lens
 from extrags.sequence import EndoscopicSequence
 
 __all__ = ["READER", "TRANSFORMS_FILE", "write_transforms"]
@@ -63,12 +62,11 @@ _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _NERFSTUDIO_DEPTH_SCALE = 1e-3
 _MM_PER_UNIT = {"mm": 1.0, "m": 1000.0, "arbitrary": 1.0}
 _FILE_KEYS = ("file_path", "mask_path", "depth_file_path")
-_DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 _KEYS = (
     *("frames", "transform_matrix", "length_unit", "depth_unit_scale_factor", "integer_depth_scale"),
     *("train_filenames", "test_filenames", "val_filenames", "ply_file_path", *_FILE_KEYS),
-    *("camera_model", "is_fisheye", "fl_x", "fl_y", "cx", "cy", "w", "h", *_DISTORTION),
+    *("camera_model", "is_fisheye", "fl_x", "fl_y", "cx", "cy", "w", "h", *DISTORTION_KEYS),
     *("camera_angle_x", "camera_angle_y"),
 )
 """What is read, of all frames or of one."""
@@ -148,7 +146,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
             PosedFrame(
                 name=str(Path(frame).relative_to("images")) if frame.startswith("images/") else frame,
                 file=place,
-                lens=_lens({**content, **entry}, place, file, frame),
+                lens=StatedLens({**content, **entry}, file, frame).lens(place),
                 world_from_camera=_pose(entry, scale, file, frame),
                 mask_file=_mask_file(folder, entry, frame),
                 depth_file=depth_files[frame],
@@ -330,83 +328,6 @@ def _pose(entry: dict[str, Any], scale: float, file: Path, frame: str) -> Float[
     pose = matrix @ _OPENCV_FROM_OPENGL
     pose[:3, 3] *= scale
     return pose
-
-
-def _lens(values: dict[str, Any], image: Path, file: Path, frame: str) -> Lens:
-    def number(key: str, otherwise: float | None = None) -> float:
-        if key not in values and otherwise is not None:
-            return otherwise
-        try:
-            return float(values[key])
-        except (KeyError, OverflowError, TypeError, ValueError) as error:
-            raise SourceError(
-                f"{key} = {values.get(key)!r}; expected a number", file=file, frame=frame, field=key
-            ) from error
-
-    if "w" in values and "h" in values:
-        if not (np.isfinite(number("w")) and np.isfinite(number("h"))):
-            raise SourceError("no image size; expected w and h in pixels", file=file, frame=frame, field="w")
-        width, height = int(number("w")), int(number("h"))
-    else:
-        width, height = image_size(image, frame=frame)
-    if "fl_x" in values or "fl_y" in values:
-        fx = number("fl_x") if "fl_x" in values else number("fl_y")
-        fy = number("fl_y", fx)
-    elif "camera_angle_x" in values:
-        fx = width / 2 / np.tan(number("camera_angle_x") / 2)
-        fy = (
-            height / 2 / np.tan(number("camera_angle_y") / 2)
-            if "camera_angle_y" in values and "fl_y" not in values
-            else fx
-        )
-    else:
-        raise SourceError(
-            "no focal length; expected fl_x (pixels) or camera_angle_x (radians), for all frames or in each",
-            file=file,
-            frame=frame,
-            field="fl_x",
-        )
-    named = {
-        "fx": fx,
-        "fy": fy,
-        "cx": number("cx", width / 2),
-        "cy": number("cy", height / 2),
-        **{key: number(key, 0.0) for key in _DISTORTION},
-    }
-    stated = str(values.get("camera_model", "OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV"))
-    model = stated
-    if model in ("PINHOLE", "SIMPLE_PINHOLE") or (
-        model == "OPENCV" and not any(named[key] for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
-    ):
-        model = "PINHOLE"
-    elif model in ("SIMPLE_RADIAL", "RADIAL") or (model == "OPENCV" and not (named["k3"] or named["k4"])):
-        model = "OPENCV"
-    elif model == "OPENCV":
-        model = "FULL_OPENCV"
-    names = LENS_PARAMETERS.get(model)
-    if names is None or not set(names) <= set(named):
-        raise SourceError(
-            f"camera_model {model!r} is not understood; expected PINHOLE, SIMPLE_PINHOLE, SIMPLE_RADIAL, "
-            "RADIAL, OPENCV, FULL_OPENCV or OPENCV_FISHEYE",
-            file=file,
-            frame=frame,
-            field="camera_model",
-        )
-    # nerfstudio's OPENCV is a polynomial of k1 to k4; COLMAP's has two, and the full one divides by k4 to k6.
-    others = ("k4", "k5", "k6") if stated == "OPENCV" else ()
-    for key in _DISTORTION:
-        if named[key] and (key not in names or key in others):
-            raise SourceError(
-                f"{key} = {named[key]:g} with camera_model {stated}, which has no such term; expected the "
-                f"model that the camera was calibrated with, or {key} = 0",
-                file=file,
-                frame=frame,
-                field=key,
-            )
-    try:
-        return Lens(model, tuple(float(named[key]) for key in names), width, height)
-    except SourceError as error:
-        raise SourceError(error.problem, file=file, frame=frame, field=error.field) from error
 
 
 def _depth_factor(content: dict[str, Any], depth_file: Path, file: Path) -> float:
