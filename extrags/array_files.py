@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from extrags.output_files import whole_file
+
 if TYPE_CHECKING:
     from torch import Tensor
 
@@ -106,9 +108,8 @@ def save_safetensors(file: Path, tensors: dict[str, Tensor], metadata: dict[str,
     from safetensors.torch import save_file
 
     file.parent.mkdir(parents=True, exist_ok=True)
-    partial = file.with_suffix(".partial")
-    save_file({name: value.contiguous() for name, value in tensors.items()}, str(partial), metadata)
-    partial.replace(file)
+    with whole_file(file) as partial:
+        save_file({name: value.contiguous() for name, value in tensors.items()}, str(partial), metadata)
 
 
 def load_state_dict(file: Path) -> dict[str, Tensor]:

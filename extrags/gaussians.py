@@ -13,6 +13,7 @@ from torch import Tensor
 
 from extrags.array_files import load_ply_vertices
 from extrags.errors import CaptureError, NonFiniteError, ShapeError, SourceError, SourceNotFoundError
+from extrags.output_files import whole_file
 from extrags.zarr_io import new_group, open_group, read_array, write_array
 
 __all__ = ["SH_C0", "Gaussians"]
@@ -222,7 +223,8 @@ class Gaussians:
         table = np.empty(n, dtype=[(name, "f4") for name in columns])
         for name, column in columns.items():
             table[name] = column
-        PlyData([PlyElement.describe(table, "vertex")]).write(str(path))
+        with whole_file(path) as partial:
+            PlyData([PlyElement.describe(table, "vertex")]).write(str(partial))
 
     @classmethod
     def read_ply(cls, path: Path) -> Gaussians:

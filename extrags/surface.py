@@ -19,6 +19,7 @@ from extrags.errors import CaptureError, ShapeError
 from extrags.events import Progress, emit
 from extrags.frame_quantiles import quantile_of_frames
 from extrags.frame_stacks import FrameStack
+from extrags.output_files import whole_file
 from extrags.radial_lens import WIDE_FIELD_DEG
 from extrags.scene import Scene
 from extrags.store.storable import Storable
@@ -81,7 +82,8 @@ class Mesh(Storable):
         face = np.empty(len(self.triangles), dtype=[("vertex_indices", "i4", (3,))])
         face["vertex_indices"] = self.triangles
         elements = [PlyElement.describe(vertex, "vertex"), PlyElement.describe(face, "face")]
-        PlyData(elements, byte_order="<").write(str(path))
+        with whole_file(path) as partial:
+            PlyData(elements, byte_order="<").write(str(partial))
 
 
 @one_torch_thread()

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from extrags.errors import ConfigError, ExtragsError
+from extrags.output_files import write_file
 from extrags.store import digest_of
 from flows.budgets import Budget, reaching
 from flows.history import SAME_MACHINE
@@ -310,6 +311,4 @@ def _claim(folder: Path, about: dict[str, Any], separate: bool) -> None:
 def _write(file: Path, content: dict[str, Any]) -> None:
     """Whole or not at all: an interrupted command leaves no half a cell."""
     file.parent.mkdir(parents=True, exist_ok=True)
-    partial = file.with_suffix(".partial")
-    partial.write_text(json.dumps(content, indent=1), encoding="utf-8")
-    partial.replace(file)
+    write_file(file, json.dumps(content, indent=1))

@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from extrags.output_files import whole_file
 from extrags.store import Ref, Store
 from flows.outcome import SequenceOutcome
 
@@ -71,9 +72,8 @@ def stage_preview(label: str, stage: str, made: Mapping[str, Ref], store: Store)
     folder = store.state / "previews"
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{re.sub(r'[^A-Za-z0-9@.]+', '-', label).strip('-')}.jpg"
-    part = path.with_suffix(".part")
-    Image.fromarray(strip).save(part, format="JPEG", quality=90)
-    part.replace(path)
+    with whole_file(path) as unfinished:
+        Image.fromarray(strip).save(unfinished, format="JPEG", quality=90)
     return path, words
 
 

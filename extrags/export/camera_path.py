@@ -13,6 +13,7 @@ import numpy as np
 
 from extrags.cameras import Cameras
 from extrags.errors import PoseError, SourceError, SourceNotFoundError
+from extrags.output_files import write_file
 from extrags.sequence_checks import check_intrinsics, check_pose
 
 __all__ = ["CameraPath", "flight_through", "read_camera_path", "write_camera_path"]
@@ -75,7 +76,7 @@ def write_camera_path(path: CameraPath, file: Path) -> None:
         "seconds": len(cameras) / path.fps,
         "camera_path": entries,
     }
-    file.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    write_file(file, json.dumps(content, indent=1) + "\n")
 
 
 def read_camera_path(file: Path) -> CameraPath:

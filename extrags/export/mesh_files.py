@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import struct
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from jaxtyping import UInt8
 
 from extrags.errors import ConfigError
 from extrags.export.textured import ColoredMesh
+from extrags.output_files import whole_file, write_file
 
 __all__ = ["MESH_FORMATS", "write_mesh"]
 
@@ -46,7 +48,7 @@ def write_mesh(colored: ColoredMesh, path: Path, *, metric: bool = True) -> tupl
     """
     suffix = path.suffix.lower()
     if suffix == ".glb":
-        path.write_bytes(_glb(colored, metric))
+        write_file(path, _glb(colored, metric))
     elif suffix == ".obj":
         return path, *_write_obj(colored, path)
     elif suffix == ".ply":
@@ -76,22 +78,23 @@ def _write_ply(colored: ColoredMesh, path: Path) -> None:
     face = np.empty(len(mesh.triangles), dtype=[("vertex_indices", "i4", (3,))])
     face["vertex_indices"] = mesh.triangles
     elements = [PlyElement.describe(vertex, "vertex"), PlyElement.describe(face, "face")]
-    PlyData(elements, byte_order="<").write(str(path))
+    with whole_file(path) as partial:
+        PlyData(elements, byte_order="<").write(str(partial))
 
 
 def _write_obj(colored: ColoredMesh, path: Path) -> tuple[Path, ...]:
     """Write the mesh; returns what was written beside it."""
     mesh, uv = colored.mesh, colored.uv
     beside: tuple[Path, ...] = ()
+    contents: dict[Path, bytes] = {}
     lines = ["# extrags; v: x y z red green blue"]
     if colored.texture is not None:
         # Both formats end a name at white space. Pictures called as the mesh are often there already.
         stem = "_".join([*path.stem.split(), "texture"])
         material, picture = beside = path.with_name(f"{stem}.mtl"), path.with_name(f"{stem}.png")
-        picture.write_bytes(_png(colored.texture))
-        material.write_text(
-            f"newmtl surface\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {picture.name}\n",
-            encoding="utf-8",
+        contents[picture] = _png(colored.texture)
+        contents[material] = (
+            f"newmtl surface\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {picture.name}\n".encode()
         )
         lines.append(f"mtllib {material.name}")
     for position, color in zip(mesh.vertices.tolist(), (colored.colors / 255).tolist(), strict=True):
@@ -113,7 +116,12 @@ def _write_obj(colored: ColoredMesh, path: Path) -> tuple[Path, ...]:
                 lines.append(
                     "f " + " ".join(f"{corner}/{3 * index + k + 1}" for k, corner in enumerate(corners))
                 )
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    contents[path] = ("\n".join(lines) + "\n").encode()
+    # All are written before the first takes its place, that of the mesh last: together they are one mesh.
+    with ExitStack() as unfinished:
+        partials = {file: unfinished.enter_context(whole_file(file)) for file in reversed(contents)}
+        for file, content in contents.items():
+            partials[file].write_bytes(content)
     return beside
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from extrags.errors import CaptureError
 from extrags.gaussians import SH_C0, Gaussians
+from extrags.output_files import whole_file
 from extrags.raster.light import shortest_axes
 
 __all__ = ["write_points"]
@@ -45,5 +46,6 @@ def write_points(gaussians: Gaussians, path: Path, *, min_opacity: float = 0.5) 
         rows[name], rows[f"n{name}"] = kept.means.numpy()[:, axis], normals[:, axis]
     for axis, name in enumerate(("red", "green", "blue")):
         rows[name] = colors[:, axis]
-    PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(path))
+    with whole_file(path) as partial:
+        PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(partial))
     return len(kept)

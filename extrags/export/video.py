@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from fractions import Fraction
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -16,7 +17,11 @@ from extrags.cameras import Cameras
 from extrags.errors import ConfigError, ShapeError, StoreError
 from extrags.events import Progress, emit
 from extrags.exploration.coverage import direction_counts, training_coverage
+from extrags.output_files import whole_file
 from extrags.scene import Scene
+
+if TYPE_CHECKING:
+    from av.container import OutputContainer
 
 __all__ = ["fly_through", "unobserved", "write_video"]
 
@@ -123,10 +128,9 @@ def write_video(
     rate = Fraction(fps).limit_denominator(1001)
     count = 0
     size: tuple[int, int] | None = None
-    with _told_of(file):
-        container = av.open(str(file), "w", format="mp4", options={"movflags": "+faststart"})
-    try:
+    with ExitStack() as stack:
         with _told_of(file):
+            container = stack.enter_context(_opened(stack.enter_context(whole_file(file)), file))
             stream = container.add_stream("libx264", rate=rate)
             stream.pix_fmt = "yuv420p"
             stream.codec_context.colorspace = Colorspace.ITU709
@@ -155,10 +159,22 @@ def write_video(
         with _told_of(file):
             for packet in stream.encode(None):
                 container.mux(packet)
+            # Closes the container, and gives the file its name.
+            stack.close()
+    return count
+
+
+@contextmanager
+def _opened(partial: Path, file: Path) -> Iterator[OutputContainer]:
+    """A container that is written to `partial`; errors name `file`."""
+    import av
+
+    container = av.open(str(partial), "w", format="mp4", options={"movflags": "+faststart"})
+    try:
+        yield container
     finally:
         with _told_of(file):
             container.close()
-    return count
 
 
 @contextmanager

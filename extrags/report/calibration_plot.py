@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from extrags.errors import ConfigError
+from extrags.output_files import whole_file
 from extrags.report.charts import METHOD_COLORS, QUIET, drawing_style, svg_image
 from extrags.report.encode import DataImage
 
@@ -40,7 +41,8 @@ def write_calibration_plot(curves: Mapping[str, Mapping[str, Any]], path: Path) 
         figure = _drawn(curves)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            figure.savefig(path, dpi=150, facecolor="white")
+            with whole_file(path) as partial:
+                figure.savefig(partial, dpi=150, facecolor="white")
         except (OSError, ValueError) as error:
             raise ConfigError(f"{path} cannot be written: {error}") from error
 

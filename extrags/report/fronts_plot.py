@@ -9,6 +9,7 @@ from typing import Any
 from extrags.errors import ConfigError
 from extrags.metrics.fronts import COSTS, SCENE
 from extrags.metrics.registry import figures
+from extrags.output_files import whole_file
 from extrags.report.charts import QUIET, drawing_style, method_marks, run_colors
 
 __all__ = ["write_fronts_plot"]
@@ -84,7 +85,8 @@ def write_fronts_plot(
             path.parent.mkdir(parents=True, exist_ok=True)
             # Without a date, so that the same numbers are the same file.
             metadata = {"Date": None} if path.suffix == ".svg" else None
-            figure.savefig(path, dpi=150, facecolor="white", metadata=metadata)
+            with whole_file(path) as partial:
+                figure.savefig(partial, dpi=150, facecolor="white", metadata=metadata)
         except (OSError, ValueError) as error:
             raise ConfigError(f"{path} cannot be written: {error}") from error
 

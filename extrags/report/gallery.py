@@ -14,6 +14,7 @@ from jaxtyping import Bool, UInt8
 from extrags.errors import ConfigError
 from extrags.metrics.registry import Metric
 from extrags.observed_surface import never_observed
+from extrags.output_files import write_file
 from extrags.report.downloads import file_name
 from extrags.report.encode import UNSEEN_RGB, as_uint8
 from extrags.report.image_table import ImageCell, Judged, image_cell, judged_table
@@ -86,7 +87,7 @@ def build_gallery(
     folder.mkdir(parents=True, exist_ok=True)
     strips = [_strip(run, folder, each, place) for place, run in enumerate(runs)]
     page = folder / "index.md"
-    page.write_text("\n".join([_head(title, command, made), *strips]), encoding="utf-8")
+    write_file(page, "\n".join([_head(title, command, made), *strips]))
     return page
 
 
@@ -197,7 +198,7 @@ def _table(cells: Sequence[ImageCell], said: Mapping[str, str], folder: Path, st
     for place, cell in enumerate(cells, start=1):
         kind, content = cell.image.uri.split(",", 1)
         file = f"{stem}_{place}.{'png' if 'image/png' in kind else 'jpg'}"
-        (folder / file).write_bytes(base64.b64decode(content))
+        write_file(folder / file, base64.b64decode(content))
         shown.append(f"![{_plain(cell.alt)}]({file})")
     rows = [[_plain(cell.label) for cell in cells], ["---"] * len(cells), shown]
     if said:

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, UInt32
 
 from extrags.gaussians import SH_C0, Gaussians
+from extrags.output_files import whole_file
 from extrags.splat_files.packing import largest_component, morton_order, unit_quaternions
 
 __all__ = ["write_compressed_ply"]
@@ -76,7 +77,8 @@ def write_compressed_ply(gaussians: Gaussians, path: Path) -> None:
         for k in range(rest_n.shape[1]):
             sh[f"f_rest_{k}"] = np.floor((rest_n[:, k] / 8 + 0.5) * 256).clip(0, 255)
         elements.append(PlyElement.describe(sh, "sh"))
-    PlyData(elements, byte_order="<").write(str(path))
+    with whole_file(path) as partial:
+        PlyData(elements, byte_order="<").write(str(partial))
 
 
 def _chunk_bounds(values: Float[np.ndarray, "n k"]) -> tuple[np.ndarray, np.ndarray]:

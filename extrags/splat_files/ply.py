@@ -17,6 +17,7 @@ import torch
 from extrags.errors import SourceError
 from extrags.gaussians import Gaussians
 from extrags.illumination import INITIAL_ROUGHNESS, NearFieldLight
+from extrags.output_files import whole_file
 from extrags.scene import Scene
 
 __all__ = ["read_ply_scene", "write_ply_scene"]
@@ -52,9 +53,11 @@ def write_ply_scene(scene: Scene, path: Path) -> None:
     # In several lines: readers keep a line of the header in a buffer of about a thousand bytes.
     parts = (text[start : start + _LINE_BYTES] for start in range(0, len(text), _LINE_BYTES))
     lines = b"".join(_MARK + part + b"\n" for part in parts)
-    gaussians.write_ply(path)
-    head, end, body = path.read_bytes().partition(b"element vertex")
-    path.write_bytes(head + lines + end + body)
+    with whole_file(path) as partial:
+        # Looked at before, so that errors name the file itself.
+        gaussians.for_file(path).write_ply(partial)
+        head, end, body = partial.read_bytes().partition(b"element vertex")
+        partial.write_bytes(head + lines + end + body)
 
 
 def _with_rotations(gaussians: Gaussians) -> Gaussians:

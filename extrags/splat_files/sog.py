@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float, Int, Shaped, UInt8
 
 from extrags.gaussians import Gaussians
+from extrags.output_files import whole_file
 from extrags.splat_files.packing import largest_component, morton_order, unit_quaternions
 
 __all__ = ["write_sog"]
@@ -98,7 +99,7 @@ def write_sog(gaussians: Gaussians, path: Path) -> None:
             "codebook": codebook.tolist(),
             "files": ["shN_centroids.webp", "shN_labels.webp"],
         }
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as bundle:
+    with whole_file(path) as partial, zipfile.ZipFile(partial, "w", zipfile.ZIP_STORED) as bundle:
         bundle.writestr(zipfile.ZipInfo("meta.json", _TIME), json.dumps(meta))
         for name, pixels in images.items():
             bundle.writestr(zipfile.ZipInfo(name, _TIME), _webp(pixels))

@@ -24,6 +24,7 @@ from jaxtyping import Float, UInt8
 
 from extrags.errors import SourceError, SourceNotFoundError
 from extrags.gaussians import Gaussians
+from extrags.output_files import write_file
 from extrags.splat_files.packing import largest_component, unit_quaternions
 from extrags.splat_files.spz_streams import read_header, read_planes
 
@@ -83,7 +84,7 @@ def write_spz(gaussians: Gaussians, path: Path) -> None:
     content = [positions, opacities, colors, scales, packed.astype("<u4"), harmonics]
     body = b"".join(np.ascontiguousarray(part).tobytes() for part in content)
     # No time stamp: the same scene gives the same file.
-    path.write_bytes(gzip.compress(header + body, mtime=0))
+    write_file(path, gzip.compress(header + body, mtime=0))
 
 
 def read_spz(path: Path) -> Gaussians:

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from extrags.errors import ConfigError
+from extrags.output_files import whole_file
 from extrags.report.charts import METHOD_COLORS, drawing_style
 from extrags.stress.optimiser import Drift
 
@@ -48,6 +49,7 @@ def write_drift_plot(trainings: Mapping[str, Sequence[Drift]], path: Path) -> No
         panels[0].legend(loc="upper left")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            figure.savefig(path, dpi=150, facecolor="white")
+            with whole_file(path) as partial:
+                figure.savefig(partial, dpi=150, facecolor="white")
         except (OSError, ValueError) as error:
             raise ConfigError(f"{path} cannot be written: {error}") from error

@@ -30,6 +30,7 @@ from extrags.config import CaptionConfig
 from extrags.data_directories import cache_directory
 from extrags.errors import ConfigError, ExtragsError, SourceError, SourceNotFoundError
 from extrags.events import MetricRecorded, emit
+from extrags.output_files import write_file
 from extrags.sequence import EndoscopicSequence
 
 __all__ = ["CACHE_VARIABLE", "KEY_VARIABLE", "URL_VARIABLE", "Caption", "caption_of", "check_source"]
@@ -219,10 +220,8 @@ def _cache_folder() -> Path:
 
 def _keep(file: Path, caption: Caption) -> None:
     file.parent.mkdir(parents=True, exist_ok=True)
-    # Renamed into place, so that another process never reads half an answer.
-    scratch = file.with_suffix(f".{os.getpid()}")
-    scratch.write_text(json.dumps(caption.as_dict(), indent=2) + "\n", encoding="utf-8")
-    scratch.replace(file)
+    # Whole, so that another process never reads half an answer.
+    write_file(file, json.dumps(caption.as_dict(), indent=2) + "\n")
 
 
 def _ask(address: str, key: str, question: dict[str, Any], config: CaptionConfig) -> dict[str, Any]:
