@@ -26,9 +26,12 @@ from pathlib import Path
 from types import FrameType
 from typing import NoReturn
 
-__all__ = ["INTERRUPTED", "interruptible", "say_when_interrupted", "until_told_to_stop"]
+__all__ = ["INTERRUPTED", "RESUMABLE", "interruptible", "say_when_interrupted", "until_told_to_stop"]
 
-INTERRUPTED = "the run was interrupted; finished stages are kept, and the same command resumes"
+INTERRUPTED = "interrupted before the end"
+"""For commands that do not say what their interruption means."""
+RESUMABLE = "the run was interrupted; finished stages are kept, and the same command resumes"
+"""For commands that run stages."""
 
 UNWINDING_SECONDS = 3.0
 """How long the main thread may take to unwind."""
@@ -42,7 +45,7 @@ _sentence = INTERRUPTED
 
 
 def say_when_interrupted(sentence: str) -> None:
-    """For a command whose interruption means something else than `INTERRUPTED`."""
+    """For a command that can say more than `INTERRUPTED`."""
     global _sentence
     _sentence = sentence
 
@@ -92,6 +95,9 @@ class _Interruption:
         """
         with self._guard:
             _end_children()
+            output_files = sys.modules.get("extrags.output_files")
+            if output_files is not None:
+                output_files.remove_unfinished()
             sys.stdout.flush()
             os._exit(128 + int(self.signal or signal.SIGINT))
 

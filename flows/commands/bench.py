@@ -17,6 +17,7 @@ from extrags.metrics.registry import figures
 from flows.commands import bench_compare, bench_explore, bench_pipeline, bench_stability
 from flows.commands.common import items, set_up_logging, write_json
 from flows.commands.options import Parser, add_json, add_profile, add_sequences, add_settings, add_verb
+from flows.commands.outputs import output_file
 
 __all__ = ["add_arguments", "enhance", "raster", "train"]
 
@@ -114,7 +115,10 @@ def _add_enhance(parser: Parser) -> None:
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of all stages (default: 0)")
     add_settings(parser)
     parser.add_argument(
-        "--figure", metavar="FILE.png", help="draw predicted against true error (the calibration)"
+        "--figure",
+        metavar="FILE.png",
+        type=output_file,
+        help="draw predicted against true error (the calibration)",
     )
     add_json(parser)
 

@@ -9,6 +9,7 @@ from typing import Any
 from extrags.errors import ConfigError
 from flows.commands.common import items, set_up_logging, store_root, write_json
 from flows.commands.options import Parser, add_json, add_profile, add_sequences, add_settings, add_store
+from flows.interruption import RESUMABLE, say_when_interrupted
 
 __all__ = ["add_arguments", "explore"]
 
@@ -62,6 +63,7 @@ def add_arguments(parser: Parser) -> None:
 
 def explore(given: argparse.Namespace) -> int:
     """`extrags bench explore`."""
+    say_when_interrupted(RESUMABLE)
     set_up_logging(debug=given.debug, terminal=True, quiet=given.quiet)
     # Read when torch is loaded.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")

@@ -9,9 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from extrags.errors import ConfigError
+from extrags.output_files import write_file
 from flows.commands.benchmark import parsed_seeds
 from flows.commands.common import items, set_up_logging, write_json
 from flows.commands.options import Parser, add_json, add_methods, add_output, add_sequences, add_settings
+from flows.commands.outputs import output_folder
+from flows.interruption import RESUMABLE, say_when_interrupted
 
 __all__ = ["EXAMPLES", "add_arguments", "pipeline"]
 
@@ -74,8 +77,8 @@ def add_arguments(parser: Parser) -> None:
     add_output(
         parser,
         "DIR",
-        type=Path,
-        default=Path("bench-pipeline"),
+        output_folder,
+        default="bench-pipeline",
         help="folder of the grid: stores, finished runs, grid.md, fronts.svg, results.json "
         "(default: bench-pipeline)",
     )
@@ -85,6 +88,7 @@ def add_arguments(parser: Parser) -> None:
 
 def pipeline(given: argparse.Namespace) -> int:
     """`extrags bench pipeline`."""
+    say_when_interrupted(RESUMABLE)
     set_up_logging(debug=given.debug, terminal=True, quiet=given.quiet)
     # Read when torch is loaded; the processes of the runs inherit it.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -92,7 +96,7 @@ def pipeline(given: argparse.Namespace) -> int:
         raise ConfigError(f"--repeats {given.repeats}: expected 1 or more")
     from flows.environment import prepare
 
-    folder: Path = given.output
+    folder = Path(given.output)
     prepare(folder.absolute() / "state", debug=given.debug)
     from extrags.config import profile_config
     from extrags.report.fronts_plot import write_fronts_plot
@@ -117,9 +121,9 @@ def pipeline(given: argparse.Namespace) -> int:
     _check_models(cells, preflight)
     found = run_grid(cells, folder, separate=given.separate)
     text = json.dumps(found, indent=1)
-    (folder / "results.json").write_text(text, encoding="utf-8")
+    write_file(folder / "results.json", text)
     table = grid_markdown(found)
-    (folder / "grid.md").write_text(table, encoding="utf-8")
+    write_file(folder / "grid.md", table)
     measured = any(cell["runs"] for cell in found["cells"])
     if measured:
         for suffix in (".svg", ".png"):

@@ -10,6 +10,7 @@ from typing import Any
 from extrags.errors import ConfigError
 from flows.commands.common import items, set_up_logging, write_json
 from flows.commands.options import Parser, add_json
+from flows.commands.outputs import output_file
 
 __all__ = ["EXAMPLES", "add_arguments", "stability"]
 
@@ -49,7 +50,10 @@ def add_arguments(parser: Parser) -> None:
     )
     parser.add_argument("--threads", default=1, **whole, help="threads of kernels and torch (default: 1)")
     parser.add_argument(
-        "--figure", metavar="FILE", help="also draw the drift of the trainings (.svg, .png, .pdf)"
+        "--figure",
+        metavar="FILE",
+        type=output_file,
+        help="also draw the drift of the trainings (.svg, .png, .pdf)",
     )
     add_json(parser)
 

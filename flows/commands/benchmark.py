@@ -26,6 +26,7 @@ from flows.commands.options import (
     add_settings,
     add_store,
 )
+from flows.interruption import RESUMABLE, say_when_interrupted
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -92,6 +93,7 @@ def benchmark(given: argparse.Namespace) -> int:
     from extrags.store import Store
     from flows.environment import prepare, without_heartbeat
 
+    say_when_interrupted(RESUMABLE)
     terminal = sys.stderr.isatty()
     set_up_logging(debug=given.debug, terminal=terminal, quiet=given.quiet)
     root = store_root(given)

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from extrags.errors import ConfigError, ExtragsError, StoreError
 from extrags.redaction import CredentialFilter, without_credentials
+from flows.commands.outputs import STANDARD_OUTPUT, write_output
 
 if TYPE_CHECKING:
     from extrags.config import PipelineConfig
@@ -224,14 +225,10 @@ def write_json(value: Any, target: str | None) -> None:
     if target is None:
         return
     text = json.dumps(value, indent=1, allow_nan=False) + "\n"
-    if target == "-":
+    if target == STANDARD_OUTPUT:
         sys.stdout.write(text)
-        return
-    try:
-        Path(target).parent.mkdir(parents=True, exist_ok=True)
-        Path(target).write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise StoreError(f"{target} cannot be written: {error.strerror or error}") from error
+    else:
+        write_output(target, text)
 
 
 def write_page(page: str, target: str) -> str:
@@ -240,13 +237,8 @@ def write_page(page: str, target: str) -> str:
     Raises:
         StoreError: when it cannot be written.
     """
-    place = Path(target).expanduser().absolute()
-    try:
-        place.parent.mkdir(parents=True, exist_ok=True)
-        place.write_text(without_credentials(page), encoding="utf-8")
-    except OSError as error:
-        raise StoreError(f"{target} cannot be written: {error.strerror or error}") from error
-    return str(place)
+    write_output(target, without_credentials(page))
+    return str(Path(target).absolute())
 
 
 def set_up_logging(*, debug: bool, terminal: bool, quiet: bool = False) -> None:

@@ -8,6 +8,7 @@ from dataclasses import replace
 from extrags.errors import ConfigError
 from flows.commands.common import items, set_up_logging, store_root, write_page
 from flows.commands.options import Parser, add_output, add_store
+from flows.commands.outputs import output_file
 
 __all__ = ["add_arguments", "compare"]
 
@@ -42,7 +43,7 @@ def add_arguments(parser: Parser) -> None:
         "--views", type=int, default=6, metavar="N", help="held-out views in pictures (default: %(default)s)"
     )
     add_store(parser)
-    add_output(parser, "FILE", default="comparison.html", help="the page (default: %(default)s)")
+    add_output(parser, "FILE", output_file, default="comparison.html", help="the page (default: %(default)s)")
 
 
 def compare(given: argparse.Namespace) -> int:

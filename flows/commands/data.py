@@ -7,8 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from extrags.errors import SourceNotFoundError, StoreError, UnknownSequenceError
+from extrags.output_files import whole_file
 from flows.commands.common import counted, set_up_logging, write_json
 from flows.commands.options import Parser, add_json, add_sequence, add_settings, add_verb
+from flows.commands.outputs import output_file
 
 if TYPE_CHECKING:
     from data_catalog import Descriptor
@@ -32,6 +34,7 @@ def add_arguments(parser: Parser) -> None:
     made.add_argument(
         "--picture",
         metavar="FILE.png",
+        type=output_file,
         help="write a contact sheet: masks blue, highlights green, held-out framed",
     )
     add_json(made)
@@ -206,7 +209,8 @@ def _write_picture(sequence: EndoscopicSequence, target: Path) -> None:
 
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(contact_sheet(sequence)).save(target)
+        with whole_file(target) as unfinished:
+            Image.fromarray(contact_sheet(sequence)).save(unfinished)
     except (OSError, ValueError) as error:
         raise StoreError(f"{target} cannot be written: {error}") from error
 

@@ -6,9 +6,12 @@ import argparse
 from pathlib import Path
 
 from extrags.errors import ConfigError, StoreError
+from extrags.output_files import whole_folder
 from flows.commands.common import counted, set_up_logging
 from flows.commands.export_scene import ALONG
 from flows.commands.options import Parser, add_method, add_output, add_sequence
+from flows.commands.outputs import made_folder, output_place
+from flows.interruption import say_when_interrupted
 
 __all__ = ["add_arguments", "export"]
 
@@ -18,6 +21,7 @@ FLOWN = ("camera-path", "video")
 SEQUENCES = ("colmap", "colmap-text", "transforms")
 
 SUFFIXES = {
+    "ply": (".ply",),
     "compressed-ply": (".ply",),
     "spz": (".spz",),
     "sog": (".sog",),
@@ -26,7 +30,7 @@ SUFFIXES = {
     "camera-path": (".json",),
     "video": (".mp4",),
 }
-"""How the file's name must end: programs choose their reader by it."""
+"""How the file's name must end: programs choose their reader by it. Without `--to`, the first that fits."""
 
 APPLIES = {
     "scene": COLORED,
@@ -42,6 +46,8 @@ APPLIES = {
     "panels": ("video",),
 }
 """Options, and what they say something about."""
+
+INTERRUPTED = "the export was interrupted; nothing was written, and what was there before is as it was"
 
 PANELS = ("coarse", "final", "uncertainty")
 
@@ -59,14 +65,15 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument(
         "--to",
         choices=(*COLORED, *FLOWN, *SEQUENCES),
-        default="ply",
         help="ply, compressed-ply, spz, sog: Gaussians, from the largest to the smallest file; mesh: surface "
         "with texture, of the kind that FILE ends with (.glb, .ply, .obj: then NAME_texture.mtl and "
         "NAME_texture.png are written beside NAME.obj); points: centres of the Gaussians; "
         "camera-path: JSON of nerfstudio's viewer; video: H.264; colmap, colmap-text, transforms: the "
-        "sequence (default: ply)",
+        "sequence (default: by the ending of FILE; .ply: ply)",
     )
-    add_output(parser, "FILE|DIR", required=True, help="file, or folder of a sequence, to write")
+    add_output(
+        parser, "FILE|DIR", output_place, required=True, help="file, or folder of a sequence, to write"
+    )
     parser.add_argument(
         "--scene",
         choices=("final", "coarse"),
@@ -134,6 +141,8 @@ def add_arguments(parser: Parser) -> None:
 
 def export(given: argparse.Namespace) -> int:
     """`extrags export`."""
+    say_when_interrupted(INTERRUPTED)
+    given.to = given.to or _by_ending(given.output)
     _check(given)
     if given.to in SEQUENCES:
         set_up_logging(debug=given.debug, terminal=True, quiet=given.quiet)
@@ -141,6 +150,25 @@ def export(given: argparse.Namespace) -> int:
     from flows.commands.export_scene import export_scene
 
     return export_scene(given)
+
+
+def _by_ending(output: str) -> str:
+    """What is to be written where only the file's name says it.
+
+    Raises:
+        ConfigError: when it does not.
+    """
+    suffix = Path(output).suffix.lower()
+    for name, suffixes in SUFFIXES.items():
+        if suffix in suffixes:
+            return name
+    sequences = ", ".join(SEQUENCES)
+    if Path(output).is_dir():
+        raise ConfigError(f"--output {output} is a folder; expected a file, or one of --to {sequences}")
+    known = ", ".join(dict.fromkeys(suffix for suffixes in SUFFIXES.values() for suffix in suffixes))
+    raise ConfigError(
+        f"--output {output}: the name must end in one of {known}; a folder needs one of --to {sequences}"
+    )
 
 
 def _check(given: argparse.Namespace) -> None:
@@ -179,7 +207,8 @@ def _check(given: argparse.Namespace) -> None:
         raise ConfigError(f"--along {given.along}: there is no such file; {wanted}")
     suffixes = SUFFIXES.get(given.to)
     if suffixes and Path(given.output).suffix.lower() not in suffixes:
-        raise ConfigError(f"--output {given.output}: the name must end in {' or '.join(suffixes)}")
+        ending = " or ".join(suffixes)
+        raise ConfigError(f"--output {given.output}: the name must end in {ending} (--to {given.to})")
     if given.to not in SEQUENCES and Path(given.output).is_dir():
         raise ConfigError(f"--output {given.output} is a folder; --to {given.to} writes a file")
 
@@ -196,11 +225,12 @@ def _sequence(given: argparse.Namespace) -> int:
     found = points_of(sequence)
     points, points_rgb = found if found is not None else (None, None)
     try:
-        target.mkdir(parents=True, exist_ok=True)
-        if given.to == "transforms":
-            write_transforms(sequence, target, points=points, points_rgb=points_rgb)
-        else:
-            write_colmap(sequence, target, binary=given.to == "colmap", points=points, points_rgb=points_rgb)
+        with made_folder(target.parent), whole_folder(target) as folder:
+            if given.to == "transforms":
+                write_transforms(sequence, folder, points=points, points_rgb=points_rgb)
+            else:
+                binary = given.to == "colmap"
+                write_colmap(sequence, folder, binary=binary, points=points, points_rgb=points_rgb)
     except OSError as error:
         raise StoreError(f"{target} cannot be written: {error.strerror or error}") from error
     count = 0 if points is None else len(points)

@@ -5,13 +5,14 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from extrags.errors import ConfigError, ExtragsError, StoreError
 from flows.commands.common import finished_run, run_config, set_up_logging, showing
+from flows.commands.outputs import made_folder
 
 if TYPE_CHECKING:
     from extrags.cameras import Cameras
@@ -44,7 +45,7 @@ def export_scene(given: argparse.Namespace) -> int:
     write = {"camera-path": _camera_path, "video": _video, "mesh": _mesh, "points": _points}
     with _progress(given):
         try:
-            with _folder(target.parent):
+            with made_folder(target.parent):
                 said = write.get(given.to, _gaussians)(given, target)
         except ExtragsError:
             # Some are errors of files as well, and say themselves which one and why.
@@ -53,21 +54,6 @@ def export_scene(given: argparse.Namespace) -> int:
             raise StoreError(f"{target} cannot be written: {error.strerror or error}") from error
     print(f"{target}: {said}")
     return 0
-
-
-@contextmanager
-def _folder(wanted: Path) -> Iterator[None]:
-    """Make a folder, and take back what was made where nothing comes to lie in it."""
-    made = [folder for folder in (wanted, *wanted.parents) if not folder.exists()]
-    # At once: a place that cannot be written must not be found out after all the work.
-    wanted.mkdir(parents=True, exist_ok=True)
-    try:
-        yield
-    except BaseException:
-        with suppress(OSError):
-            for folder in made:
-                folder.rmdir()
-        raise
 
 
 @contextmanager

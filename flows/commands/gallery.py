@@ -14,6 +14,7 @@ from extrags.errors import ConfigError, StoreError
 from extrags.source_commit import source_commit
 from flows.commands.common import items, run_options, set_up_logging, store_root, without_folders
 from flows.commands.options import Parser, add_output, add_store
+from flows.commands.outputs import output_folder
 
 if TYPE_CHECKING:
     from flows.outcome_records import OutcomeRecord
@@ -54,7 +55,9 @@ def add_arguments(parser: Parser) -> None:
         metavar="N",
         help="bound on all images together (default: %(default)s)",
     )
-    add_output(parser, "FOLDER", default="gallery", help="for page and images (default: %(default)s)")
+    add_output(
+        parser, "FOLDER", output_folder, default="gallery", help="for page and images (default: %(default)s)"
+    )
 
 
 def gallery(given: argparse.Namespace) -> int:

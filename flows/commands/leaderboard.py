@@ -8,6 +8,7 @@ from pathlib import Path
 from extrags.errors import StoreError
 from flows.commands.common import set_up_logging, store_root, write_page
 from flows.commands.options import Parser, add_output, add_store
+from flows.commands.outputs import output_file
 
 __all__ = ["add_arguments", "leaderboard"]
 
@@ -24,7 +25,9 @@ def add_arguments(parser: Parser) -> None:
     )
     add_store(parser)
     parser.add_argument("--name", default="Leaderboard", help="title of the page (default: %(default)s)")
-    add_output(parser, "FILE", default="leaderboard.html", help="the page (default: %(default)s)")
+    add_output(
+        parser, "FILE", output_file, default="leaderboard.html", help="the page (default: %(default)s)"
+    )
 
 
 def leaderboard(given: argparse.Namespace) -> int:

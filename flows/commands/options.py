@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
 import shlex
 import shutil
 import textwrap
@@ -18,6 +17,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from extrags.errors import ConfigError, did_you_mean
 from flows.commands.common import items, parsed_settings
+from flows.commands.outputs import file_or_standard_output
 
 if TYPE_CHECKING:
     from extrags.config.settings import Setting
@@ -144,15 +144,16 @@ def add_methods(parser: Parser) -> None:
     )
 
 
-def add_output(parser: Parser, metavar: str, **more: Any) -> None:
+def add_output(parser: Parser, metavar: str, kind: Callable[[str], str], **more: Any) -> None:
     """`-o` and `--output`; `--out`, which some verbs once called it, is understood and not shown.
 
     Args:
         parser: of a verb.
         metavar: what is written, e.g. `FILE`.
+        kind: of `flows.commands.outputs`: `output_file`, `output_folder`, or `output_place` for either.
         more: for `add_argument`: at least `help`.
     """
-    made = parser.add_argument("-o", "--output", metavar=metavar, **more)
+    made = parser.add_argument("-o", "--output", metavar=metavar, type=kind, **more)
     # Not a name of the action: help and completion list those, and two options could not both be required.
     parser._option_string_actions["--out"] = made
 
@@ -166,25 +167,12 @@ def add_store(parser: Parser) -> None:
     )
 
 
-def _writable(target: str) -> str:
-    """A file to be written at the end: what is wrong with its place is said before hours of work."""
-    if target == "-":
-        return target
-    place = Path(target).expanduser().absolute()
-    if place.is_dir():
-        raise argparse.ArgumentTypeError(f"{target} is a folder; expected a file")
-    nearest = next(folder for folder in place.parents if folder.exists())
-    if not (nearest.is_dir() and os.access(nearest, os.W_OK)):
-        raise argparse.ArgumentTypeError(f"{target} cannot be written: nothing can be made in {nearest}")
-    return target
-
-
 def add_json(parser: Parser) -> None:
     """`--json`."""
     parser.add_argument(
         "--json",
         metavar="FILE|-",
-        type=_writable,
+        type=file_or_standard_output,
         help="write the results as JSON to a file or to standard output",
     )
 

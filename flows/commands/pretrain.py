@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING, Any
 from extrags.errors import ConfigError
 from flows.commands.common import set_up_logging, showing, training_settings
 from flows.commands.options import Parser, add_output
+from flows.commands.outputs import output_folder
 from flows.commands.pretrain_scenes import SOURCES, make_scenes, scene_sources
+from flows.interruption import say_when_interrupted
 
 if TYPE_CHECKING:
     from extrags.restoration.diffusion.pretraining import PretrainingConfig
@@ -21,6 +23,10 @@ __all__ = ["add_arguments", "pretrain"]
 
 
 CHECKPOINT = "checkpoint.safetensors"
+INTERRUPTED = (
+    "pretraining was interrupted; finished scenes, and the last checkpoint of a restorer, are kept, and the "
+    "same command goes on from them"
+)
 
 
 def add_arguments(parser: Parser) -> None:
@@ -31,7 +37,9 @@ def add_arguments(parser: Parser) -> None:
         "on two cores. Pretraining scenes that are in the folder already are taken from there."
     )
     parser.set_defaults(command=pretrain)
-    add_output(parser, "FOLDER", help="where the weights go; needed unless only scenes are made")
+    add_output(
+        parser, "FOLDER", output_folder, help="where the weights go; needed unless only scenes are made"
+    )
     _add_scenes(parser)
     _add_training(parser)
     _add_networks(parser)
@@ -50,6 +58,7 @@ def _add_scenes(parser: Parser) -> None:
     """Where scenes come from, and how they are made."""
     parser.add_argument(
         "--scenes-folder",
+        type=output_folder,
         default=".extrags/pretraining",
         metavar="FOLDER",
         help="where pretraining scenes are kept, 30 to 150 MB each (default: %(default)s)",
@@ -168,6 +177,7 @@ def _add_networks(parser: Parser) -> None:
 
 def pretrain(given: argparse.Namespace) -> int:
     """`extrags pretrain`."""
+    say_when_interrupted(INTERRUPTED)
     terminal = sys.stderr.isatty()
     set_up_logging(debug=given.debug, terminal=terminal, quiet=given.quiet)
     # Before torch is imported: threads that spin while they wait slow each other down.

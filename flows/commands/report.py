@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import shutil
 
-from extrags.errors import StoreError
 from flows.commands.common import finished_run, set_up_logging
 from flows.commands.options import Parser, add_method, add_output, add_sequence
+from flows.commands.outputs import output_file, write_output
 
 __all__ = ["add_arguments", "report"]
 
@@ -17,7 +16,7 @@ def add_arguments(parser: Parser) -> None:
     parser.set_defaults(command=report)
     add_sequence(parser)
     add_method(parser)
-    add_output(parser, "FILE", help="also write the page to this file")
+    add_output(parser, "FILE", output_file, help="also write the page to this file")
 
 
 def report(given: argparse.Namespace) -> int:
@@ -34,9 +33,6 @@ def report(given: argparse.Namespace) -> int:
     run.report_again()
     page = run.store.open(run.refs["report"]) / PAGE
     if given.output:
-        try:
-            shutil.copyfile(page, given.output)
-        except OSError as error:
-            raise StoreError(f"{given.output} cannot be written: {error.strerror or error}") from error
+        write_output(given.output, page.read_bytes())
     print(given.output or page)
     return 0

@@ -36,6 +36,7 @@ from flows.commands.options import (
 )
 from flows.commands.run_checks import check_methods, check_names, check_working_distance, wrong_source
 from flows.failures import describe_error
+from flows.interruption import RESUMABLE, say_when_interrupted
 from flows.outcome import DatasetFailedError, DatasetOutcome, SequenceOutcome
 
 if TYPE_CHECKING:
@@ -220,6 +221,7 @@ def execute(
     from flows.environment import has_own_home, prepare
     from flows.temporary_server import start_early, stop_early
 
+    say_when_interrupted(RESUMABLE)
     set_up_logging(debug=given.debug, terminal=sys.stderr.isatty(), quiet=given.quiet)
     root = store_root(given)
     several = several or Several(methods=(given.method,), seeds=(given.seed,))

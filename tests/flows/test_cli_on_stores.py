@@ -114,7 +114,7 @@ class TestFinished:
         self, finished: tuple[str, SequenceOutcome], tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         store, _ = finished
-        page = tmp_path / "page.html"
+        page = tmp_path / "new" / "page.html"
         assert main(["report", SEQUENCE, *settled(store), "-o", str(page)]) == 0
         assert capsys.readouterr().out.strip() == str(page)
         assert "</html>" in page.read_text()

@@ -82,7 +82,8 @@ class TestGaussians:
         assert export(finished, "-o", str(tmp_path / "a.ply")) == 0
         assert "light baked, recorded" in capsys.readouterr().out
         plain = Scene(decoders.ply(tmp_path / "a.ply"))
-        assert export(finished, "--to", "spz", "-o", str(tmp_path / "a.spz")) == 0
+        # Without --to, the name says what is written.
+        assert export(finished, "-o", str(tmp_path / "a.spz")) == 0
         assert psnr(Scene(decoders.spz(tmp_path / "a.spz")), plain, sequence) > 35
         # As bright as the recording on average, which the albedo is not.
         lit = final_scene(finished)
@@ -221,7 +222,8 @@ class TestCameras:
         assert found > 3
 
     def test_transforms(self, finished: Finished, tmp_path: Path) -> None:
-        assert export(finished, "--to", "transforms", "-o", str(tmp_path / "scene")) == 0
+        assert export(finished, "--to", "transforms", "-o", str(tmp_path / "new" / "scene")) == 0
+        (tmp_path / "new" / "scene").rename(tmp_path / "scene")
         given = frames(finished)
         content = json.loads((tmp_path / "scene" / "transforms.json").read_text())
         centers = np.array([np.array(frame["transform_matrix"])[:3, 3] for frame in content["frames"]])
@@ -235,6 +237,13 @@ class TestUsage:
         ("arguments", "message"),
         [
             (["--to", "spz", "-o", "a.ply"], "must end in .spz"),
+            (["--to", "ply", "-o", "a.glb"], "must end in .ply (--to ply)"),
+            (["-o", "a.stl"], "must end in one of .ply, .spz, .sog, .glb, .obj, .json, .mp4; a folder needs"),
+            (["-o", "a"], "a folder needs one of --to colmap, colmap-text, transforms"),
+            (
+                ["--to", "transforms", "-o", "/dev/null/a"],
+                "cannot be written: nothing can be made in /dev/null",
+            ),
             (["--to", "mesh", "-o", "a.stl"], "must end in .glb or .obj or .ply"),
             (["--to", "video", "-o", "a.avi"], "must end in .mp4"),
             (["--to", "spz", "--between", "3", "-o", "a.spz"], "--between says nothing about --to spz"),
@@ -300,9 +309,34 @@ class TestUsage:
         assert export(finished, *arguments) == 0
         assert target.is_file()
 
+    def test_a_sequence_that_is_interrupted_leaves_nothing(
+        self, finished: Finished, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        from data_catalog.readers import transforms_json
+
+        def interrupted(file: Path, *_: object) -> None:
+            assert file.parent.is_dir()
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr(transforms_json, "_write_points", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            export(finished, "--to", "transforms", "-o", str(tmp_path / "new" / "scene"))
+        assert list(tmp_path.iterdir()) == []
+
+    @pytest.mark.parametrize(
+        ("name", "what"), [("a.glb", "mesh"), ("b.OBJ", "mesh"), ("c.json", "camera-path")]
+    )
+    def test_the_name_says_what_is_written(
+        self, name: str, what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        asked = []
+        monkeypatch.setattr(export_scene, "export_scene", lambda given: asked.append(given.to) or 0)
+        assert main(["export", SEQUENCE, "--store", str(tmp_path), "-o", str(tmp_path / name)]) == 0
+        assert asked == [what]
+
     def test_a_folder_that_cannot_be_written(
         self, finished: Finished, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         (tmp_path / "file").write_text("x")
-        assert export(finished, "--to", "points", "-o", str(tmp_path / "file" / "a.ply")) == 1
+        assert export(finished, "--to", "points", "-o", str(tmp_path / "file" / "a.ply")) == 2
         assert "cannot be written" in capsys.readouterr().err

@@ -17,7 +17,8 @@ from pathlib import Path
 import pytest
 
 from extrags.store import Store
-from flows.interruption import INTERRUPTED
+from flows.commands.export import INTERRUPTED as EXPORT_INTERRUPTED
+from flows.interruption import INTERRUPTED, RESUMABLE
 from flows.outcome import SequenceOutcome
 from flows.runners import DirectRunner
 from flows.wiring import run_sequence
@@ -39,6 +40,24 @@ with interruptible():
             time.sleep(99)
         except KeyboardInterrupt:
             pass
+"""
+
+EXPORTS = """
+import sys, time
+from flows.commands import export, export_scene
+from flows.interruption import interruptible
+from extrags.output_files import whole_file
+
+def export_slowly(given):
+    with whole_file(given.output) as partial:
+        partial.write_text("half")
+        print("begun", flush=True)
+        time.sleep(99)
+
+export_scene.export_scene = export_slowly
+from flows.cli import main
+with interruptible():
+    main(["export", "phantom/0", "-o", sys.argv[1]])
 """
 
 SERVES = """
@@ -160,7 +179,7 @@ def test_an_interrupted_run_says_so_ends_at_once_and_resumes(
         assert time.monotonic() - signalled < END_S
         assert not any(is_running(child) for child in server)
     said = [line for line in output.read_text().splitlines() if not re.match(r"\d\d:\d\d:\d\d ", line)]
-    assert said == [f"extrags: {INTERRUPTED}"]
+    assert said == [f"extrags: {RESUMABLE}"]
     assert "coarse: cached" not in output.read_text()
     assert not [manifest for manifest in Store(begun).ls() if manifest.stage == "coarse"]
     assert list((begun / "scratch").iterdir()) == []
@@ -170,6 +189,16 @@ def test_an_interrupted_run_says_so_ends_at_once_and_resumes(
     states = {row.stage: row.state for row in resumed.stages}
     assert (states["ingest"], states["coarse"]) == ("cached", "ran")
     assert resumed.digests["coarse"] == finished[1].digests["coarse"]
+
+
+def test_a_command_without_stages_says_what_its_interruption_means(tmp_path: Path) -> None:
+    output = tmp_path / "output"
+    with started("-c", EXPORTS, str(tmp_path / "a.ply"), output=output) as process:
+        wait_for(lambda: "begun" in output.read_text(), "the file to be begun", PATIENCE_S)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(PATIENCE_S) == 143
+    assert output.read_text() == f"begun\nextrags: {EXPORT_INTERRUPTED}\n"
+    assert [file.name for file in tmp_path.iterdir()] == ["output"]
 
 
 def test_a_main_thread_that_does_not_end_is_ended_with_its_children(tmp_path: Path) -> None:
