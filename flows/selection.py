@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import logging
+import os
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -42,9 +44,10 @@ def chosen_sequences(given: Sequence[str]) -> list[Chosen]:
 
     Args:
         given: names, paths, patterns over the catalogue's names (`data_catalog.patterns`), and `@FILE` for
-            a manifest: a text with one of these per line, where `#` begins a comment, or a YAML or JSON
-            file with a list of names or of `{sequence: NAME, settings: {...}}`, alone or as `sequences`
-            beside `settings` for all of them.
+            a manifest: a text with one of these per line, where `#` begins a comment at the beginning of
+            a line or behind white space, unless it belongs to the path of something that is there; or a
+            YAML or JSON file with a list of names or of `{sequence: NAME, settings: {...}}`, alone or as
+            `sequences` beside `settings` for all of them.
 
     Raises:
         ConfigError: for a manifest that cannot be read, one sequence with different settings, or a name
@@ -97,20 +100,20 @@ def _without_manifests(given: Sequence[str]) -> Iterator[Chosen]:
 
 def _manifest(file: Path) -> Iterator[Chosen]:
     try:
-        text = file.read_text(encoding="utf-8")
+        # Editors of some systems begin a file with a byte-order mark.
+        text = file.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"the manifest {file} cannot be read: {error}") from error
-    if file.suffix not in (".yaml", ".yml", ".json"):
-        # `@` cannot begin a comment: it stands within names.
+    suffix = file.suffix.lower()
+    if suffix not in (".yaml", ".yml", ".json"):
         for line in text.splitlines():
-            name = line.partition("#")[0].strip()
-            if name:
+            if name := _without_comment(line):
                 yield Chosen(name)
         return
     try:
-        content = json.loads(text) if file.suffix == ".json" else yaml.safe_load(text)
+        content = json.loads(text) if suffix == ".json" else yaml.safe_load(text)
     except (ValueError, yaml.YAMLError) as error:
-        raise ConfigError(f"the manifest {file} is no {file.suffix[1:].upper()}: {error}") from error
+        raise ConfigError(f"the manifest {file} is no {suffix[1:].upper()}: {error}") from error
     shared: dict[str, Any] = {}
     if isinstance(content, dict):
         unknown = set(content) - {"sequences", "settings"}
@@ -137,6 +140,20 @@ def _manifest(file: Path) -> Iterator[Chosen]:
                 f"the manifest {file}, {where}: expected a name, or {{sequence: NAME, settings: {{...}}}}"
             )
         yield Chosen(entry["sequence"].strip(), shared | _settings(entry.get("settings"), file, where))
+
+
+def _without_comment(line: str) -> str:
+    """The name in a line of a text; empty where it holds none.
+
+    The longest part that is a path counts: folders may be called `scan #3`, with `scan` beside them.
+    """
+    line = line.strip()
+    if line.startswith("#"):
+        return ""
+    # `@` cannot begin a comment: it stands within names, as `#` does without white space before it.
+    ends = [found.start() for found in re.finditer(r"\s+#", line)]
+    parts = [line, *(line[:end] for end in reversed(ends))]
+    return next((part for part in parts if os.path.exists(os.path.expanduser(part))), parts[-1])
 
 
 def _settings(given: Any, file: Path, where: str) -> dict[str, Any]:

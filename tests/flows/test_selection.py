@@ -60,6 +60,29 @@ def test_a_text_has_one_a_line(tmp_path: Path) -> None:
     assert names([file, "phantom/2@sparse"])[-1] == "phantom/2@sparse"
 
 
+def test_a_name_may_hold_what_begins_a_comment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for folder in ("pat", "pat #3", "pat #3 #4", "scan#1"):
+        (tmp_path / folder).mkdir()
+    text = "  # all of them\npat # the first\npat #3\npat #3 #4   # the last\nscan#1\t#comment\n#scan#1\n"
+    assert names([manifest(tmp_path, "night.txt", text)]) == ["pat", "pat #3", "pat #3 #4", "scan#1"]
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("a.txt", "phantom/1@sparse\n"),
+        ("a.json", '["phantom/1@sparse"]'),
+        ("a.yaml", "- phantom/1@sparse\n"),
+        ("a.YAML", "- phantom/1@sparse\n"),
+        ("a.Json", '["phantom/1@sparse"]'),
+    ],
+)
+def test_byte_order_marks_and_upper_case(name: str, text: str, tmp_path: Path) -> None:
+    assert names([manifest(tmp_path, name, "\ufeff" + text)]) == ["phantom/1@sparse"]
+    assert names([manifest(tmp_path, name, text)]) == ["phantom/1@sparse"]
+
+
 def test_yaml_and_json_have_settings(tmp_path: Path) -> None:
     found = chosen_sequences([manifest(tmp_path, "night.yaml", YAML)])
     assert found[0] == Chosen("phantom/0@sparse", {"coarse.iterations": 500, "coarse.seed": 1})
