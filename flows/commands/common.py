@@ -22,12 +22,14 @@ if TYPE_CHECKING:
     from extrags.config import PipelineConfig
     from extrags.config.base import StageConfig
     from extrags.stages import StageName
+    from extrags.store import Store
     from flows.limits import StageLimits
     from flows.outcome_records import OutcomeRecord
     from flows.wiring import SequenceRun
 
 __all__ = [
     "counted",
+    "existing_store",
     "finished_run",
     "further_settings",
     "items",
@@ -100,13 +102,30 @@ def run_config(given: argparse.Namespace) -> PipelineConfig:
     return method_config(given.method, given.profile, given.settings, given.seed)
 
 
-def finished_run(given: argparse.Namespace, until: StageName, otherwise: str = "") -> SequenceRun:
+def existing_store(given: argparse.Namespace) -> Store:
+    """The store of `--store`, for verbs that only look: they make none.
+
+    Raises:
+        StoreError: when there is none.
+    """
+    from extrags.store import Store
+
+    store = Store(store_root(given))
+    if not store.exists():
+        raise StoreError(f"there is no store {store.root}")
+    return store
+
+
+def finished_run(
+    given: argparse.Namespace, until: StageName, otherwise: str = "", coarse_by: str = ""
+) -> SequenceRun:
     """A run that is in the store up to a stage, with the refs of what it made.
 
     Args:
         given: a verb's arguments: `sequence`, `method`, `profile`, `settings`, `seed`, `store`, `debug`.
         until: the last stage that is needed.
         otherwise: what else may be done where the run is not there, for the message.
+        coarse_by: the option that takes the coarse scene, named where only that one is there.
 
     Raises:
         StoreError: when it is not in the store.
@@ -116,6 +135,9 @@ def finished_run(given: argparse.Namespace, until: StageName, otherwise: str = "
     from flows.environment import prepare
 
     root, config = store_root(given), run_config(given)
+    missing = f"{given.sequence} with these settings is not finished in {root}; run it first{otherwise}"
+    if not Store(root).exists():
+        raise StoreError(f"{missing} (there is no such store)")
     prepare(Store(root).state, debug=given.debug)
     from flows.methods import METHODS, profile_label
     from flows.runners import NotInStoreError, StoreRunner
@@ -132,10 +154,9 @@ def finished_run(given: argparse.Namespace, until: StageName, otherwise: str = "
     try:
         outcome = run.run(until)
     except NotInStoreError as error:
-        raise StoreError(
-            f"{given.sequence} with these settings is not finished in {root}; run it first{otherwise} "
-            f"({error}){_on_record(root, given.sequence)}"
-        ) from error
+        if coarse_by and "coarse" in run.refs:
+            missing += f", or take its coarse scene, which is there, with {coarse_by}"
+        raise StoreError(f"{missing} ({error}){_on_record(root, given.sequence)}") from error
     if outcome.status == "failed":
         raise outcome.error or ExtragsError(f"{outcome.name} failed")
     return run

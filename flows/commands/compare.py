@@ -6,7 +6,7 @@ import argparse
 from dataclasses import replace
 
 from extrags.errors import ConfigError
-from flows.commands.common import items, set_up_logging, store_root, write_page
+from flows.commands.common import existing_store, items, set_up_logging, write_page
 from flows.commands.options import Parser, add_output, add_store
 from flows.commands.outputs import output_file
 
@@ -51,17 +51,16 @@ def compare(given: argparse.Namespace) -> int:
 
     Raises:
         ConfigError: for fewer than two runs, or runs of different sequences.
-        StoreError: when something of a run is gone, or the page cannot be written.
+        StoreError: when there is no such store, something of a run is gone, or the page cannot be written.
         ShapeError: when the held-out views of the runs are not the same.
     """
-    from extrags.store import Store
     from flows.commands.benchmark import parsed_seeds
     from flows.environment import prepare
 
     if given.views < 1:
         raise ConfigError(f"--views {given.views}: expected 1 or more")
     set_up_logging(debug=given.debug, terminal=True, quiet=given.quiet)
-    store = Store(store_root(given))
+    store = existing_store(given)
     prepare(store.state, debug=given.debug)
     from flows.recorded_runs import chosen_runs, compared_run, held_out_digest, run_names
 

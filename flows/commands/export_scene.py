@@ -98,18 +98,18 @@ class _Finished:
         return self.run.store.load(Exploration, self.run.refs["explore"]).trajectories
 
 
-def _finished(given: argparse.Namespace, until: StageName) -> _Finished:
+def _finished(given: argparse.Namespace, until: StageName, coarse_by: str = "") -> _Finished:
     from tasks.progress import observed
 
     # Looking up stages is no progress.
     with observed(lambda _: None):
-        run = finished_run(given, until)
+        run = finished_run(given, until, coarse_by=coarse_by)
     return _Finished(run, run_config(given))
 
 
 def _chosen(given: argparse.Namespace) -> tuple[_Finished, Scene]:
     which = given.scene or "final"
-    finished = _finished(given, "coarse" if which == "coarse" else "finetune")
+    finished = _finished(given, "coarse" if which == "coarse" else "finetune", "--scene coarse")
     return finished, finished.scene(which)
 
 
@@ -190,7 +190,7 @@ def _camera_path(given: argparse.Namespace, target: Path) -> str:
 def _video(given: argparse.Namespace, target: Path) -> str:
     from extrags.export import fly_through, write_video
 
-    finished = _finished(given, _shown_until(given))
+    finished = _finished(given, _shown_until(given), "--panels coarse")
     path = _flight(given)
     if given.panels is None:
         panels = ["coarse", "final", "uncertainty"] if finished.fine_tuned else ["final", "uncertainty"]

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from extrags import __version__
 from extrags.errors import ConfigError, StoreError
 from extrags.source_commit import source_commit
-from flows.commands.common import items, run_options, set_up_logging, store_root, without_folders
+from flows.commands.common import existing_store, items, run_options, set_up_logging, without_folders
 from flows.commands.options import Parser, add_output, add_store
 from flows.commands.outputs import output_folder
 
@@ -65,15 +65,14 @@ def gallery(given: argparse.Namespace) -> int:
 
     Raises:
         ConfigError: when the images cannot be as small as is asked for.
-        StoreError: when there is no such run, or something of one is gone.
+        StoreError: when there is no such store, no such run, or something of one is gone.
     """
-    from extrags.store import Store
     from flows.environment import prepare
 
     if given.kb < 1:
         raise ConfigError(f"--kb {given.kb}: expected 1 or more")
     set_up_logging(debug=given.debug, terminal=True, quiet=given.quiet)
-    store = Store(store_root(given))
+    store = existing_store(given)
     prepare(store.state, debug=given.debug)
     from flows.recorded_runs import gallery_run, last_runs
 

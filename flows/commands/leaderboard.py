@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 from extrags.errors import StoreError
-from flows.commands.common import set_up_logging, store_root, write_page
+from flows.commands.common import existing_store, set_up_logging, write_page
 from flows.commands.options import Parser, add_output, add_store
 from flows.commands.outputs import output_file
 
@@ -36,18 +35,14 @@ def leaderboard(given: argparse.Namespace) -> int:
     Raises:
         StoreError: when there is no such store, no such run, or the page cannot be written.
     """
-    from extrags.store import Store
-
     set_up_logging(debug=given.debug, terminal=True, quiet=given.quiet)
-    root = store_root(given)
-    if "://" not in root and not Path(root).is_dir():
-        raise StoreError(f"there is no store {root}")
+    store = existing_store(given)
     from extrags.report.leaderboard import build_leaderboard
     from flows.recorded_runs import board_rows
 
-    rows = board_rows(Store(root), given.patterns, given.output)
+    rows = board_rows(store, given.patterns, given.output)
     if not rows:
         wanted = f" of {', '.join(given.patterns)}" if given.patterns else ""
-        raise StoreError(f"no run{wanted} is on record in {root}")
+        raise StoreError(f"no run{wanted} is on record in {store.root}")
     print(write_page(build_leaderboard(rows, name=given.name), given.output))
     return 0

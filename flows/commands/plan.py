@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from extrags.errors import ConfigError, ExtragsError
-from flows.commands.common import write_json
+from flows.commands.common import run_config, store_root, write_json
 from flows.commands.options import Parser, add_json, add_method, add_runner, add_sequence
 from flows.commands.run import execute
 
 if TYPE_CHECKING:
+    from extrags.config import PipelineConfig
     from extrags.run_costs import Workload
     from flows.run_costs import RunPrediction
 
@@ -43,21 +47,11 @@ def plan(given: argparse.Namespace) -> int:
     """
     from extrags.pipeline import needs_plan
     from extrags.store import Store
-    from flows.commands.common import run_config, store_root
     from flows.methods import METHODS
 
     left_out = METHODS[given.method].leave_out
     if given.before:
-        from flows.environment import prepare
-
-        config = run_config(given)
-        prepare(Store(store_root(given)).state, debug=given.debug)
-        from flows.run_costs import predict_run
-        from flows.workloads import work_before_reading
-
-        work, stages = work_before_reading(given.sequence, config, left_out)
-        scenes = 2 if "finetune" in stages else 1
-        predicted = predict_run(Store(store_root(given)), work, stages, measured_scenes=scenes)
+        predicted = _before(given, run_config(given), left_out)
         if given.json != "-":
             print_prediction(predicted)
         write_json({"sequence": given.sequence, "predicted": predicted.to_json()}, given.json)
@@ -109,6 +103,21 @@ def plan(given: argparse.Namespace) -> int:
         given.json,
     )
     return 0
+
+
+def _before(given: argparse.Namespace, config: PipelineConfig, left_out: Mapping[str, str]) -> RunPrediction:
+    """What a run would cost; looks into the store, and makes none where there is none."""
+    from extrags.store import Store
+    from flows.environment import prepare
+
+    store = Store(store_root(given))
+    with TemporaryDirectory(prefix="extrags-") as elsewhere:
+        prepare(store.state if store.exists() else Path(elsewhere), debug=given.debug)
+        from flows.run_costs import predict_run
+        from flows.workloads import work_before_reading
+
+        work, stages = work_before_reading(given.sequence, config, left_out)
+        return predict_run(store, work, stages, measured_scenes=2 if "finetune" in stages else 1)
 
 
 def print_detail(found: str, flags: str, predicted: RunPrediction, reduced: RunPrediction) -> None:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from extrags.errors import StoreError
-from flows.commands.common import counted, store_root, write_json
+from flows.commands.common import counted, existing_store, write_json
 from flows.commands.options import Parser, add_json, add_store
 
 if TYPE_CHECKING:
@@ -55,14 +54,9 @@ def status(given: argparse.Namespace) -> int:
     Raises:
         StoreError: when there is no such store.
     """
-    from extrags.store import Store
     from flows.store_status import store_status
 
-    root = store_root(given)
-    store = Store(root)
-    if not store.exists():
-        raise StoreError(f"there is no store {root}")
-    found = store_status(store, given.patterns)
+    found = store_status(existing_store(given), given.patterns)
     if given.json != "-":
         _print(found)
     write_json(found.to_json(), given.json)

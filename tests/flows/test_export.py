@@ -190,6 +190,12 @@ class TestFlights:
             with av.open(str(target)) as container:
                 assert container.streams.video[0].width == width
         capsys.readouterr()
+        # Nothing but the coarse scene is there: what takes it is named.
+        assert export(ended, "-o", str(tmp_path / "a.ply")) == 1
+        assert "or take its coarse scene, which is there, with --scene coarse" in capsys.readouterr().err
+        assert export(ended, "--scene", "coarse", "-o", str(tmp_path / "a.ply")) == 0
+        assert export(ended, "--to", "video", "-o", str(tmp_path / "a.mp4")) == 1
+        assert "with --panels coarse" in capsys.readouterr().err
         for panels in ("final", "coarse,final", "uncertainty"):
             target = tmp_path / "new" / "folder" / "a.mp4"
             assert export(ended, "--to", "video", "--panels", panels, "-o", str(target)) == 1
