@@ -410,7 +410,11 @@ class Store:
         Those with a damaged manifest are left out, with a warning.
         """
         manifests = [self._readable_manifest(key) for key in self.backend.names()]
-        chosen = [manifest for manifest in manifests if manifest is not None and _matches(manifest, pattern)]
+        chosen = [
+            item
+            for item in manifests
+            if item is not None and _matches(pattern, item.key, item.stage, item.label)
+        ]
         return sorted(chosen, key=lambda manifest: (manifest.started, manifest.key))
 
     def _readable_manifest(self, key: str) -> Manifest | None:
@@ -421,8 +425,23 @@ class Store:
             return None
 
     def rm(self, pattern: str) -> list[str]:
-        """Remove artefacts by a shell pattern over key, stage or label; returns their keys."""
-        return [manifest.key for manifest in self.ls(pattern) if self.backend.discard(manifest.key)]
+        """Remove artefacts by a shell pattern over key, stage or label; returns their keys.
+
+        Of those with a damaged manifest the label is not known; they go by key or stage.
+        """
+        chosen = []
+        for key in self.backend.names():
+            try:
+                manifest = self.backend.read_manifest(key)
+            except DamagedArtefactError:
+                about, started = [stage_of(key)], ""
+            else:
+                if manifest is None:
+                    continue
+                about, started = [manifest.stage, manifest.label], manifest.started
+            if _matches(pattern, key, *about):
+                chosen.append((started, key))
+        return [key for _, key in sorted(chosen) if self.backend.discard(key)]
 
     def sweep_scratch(self) -> list[str]:
         """Remove scratch directories of killed processes of this machine alone; as `sweep`, but at once."""
@@ -460,8 +479,9 @@ class Store:
         return removed + self.backend.remove_damaged(dry_run=dry_run)
 
 
-def _matches(manifest: Manifest, pattern: str) -> bool:
-    return any(fnmatchcase(text, pattern) for text in (manifest.key, manifest.stage, manifest.label))
+def _matches(pattern: str, *names: str) -> bool:
+    """Whether one of the names is meant, exactly or by a shell pattern: a folder's may have brackets."""
+    return any(name == pattern or fnmatchcase(name, pattern) for name in names)
 
 
 def _key_of(ref: Ref) -> str:

@@ -271,7 +271,9 @@ def _print_restorers(cases: list[dict[str, Any]]) -> None:
         chosen = [case for case in cases if case["sequence"] == sequence]
         shares = ", ".join(f"{name} {share:.0%}" for name, share in chosen[0]["pixel_share"].items())
         console().print(
-            f"{sequence}: {chosen[0]['views']} held-out views; {shares} of the pixels", soft_wrap=True
+            f"{sequence}: {chosen[0]['views']} held-out views; {shares} of the pixels",
+            soft_wrap=True,
+            markup=False,
         )
         rows = []
         for case in chosen:
@@ -344,6 +346,7 @@ def _realism_row(case: dict[str, Any]) -> list[Any]:
 
 
 def _print(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+    from rich.markup import escape
     from rich.table import Table
 
     from flows.terminal import console
@@ -352,7 +355,7 @@ def _print(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
     for name in header:
         table.add_column(name)
     for row in rows:
-        table.add_row(*(_text(value) for value in row))
+        table.add_row(*(escape(_text(value)) for value in row))
     console().print(table)
 
 

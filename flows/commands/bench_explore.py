@@ -131,6 +131,7 @@ def _print(found: dict[str, Any]) -> None:
             f"{truth['never_seen_share']:.1%} and saw {truth['badly_seen_share']:.1%} badly; "
             f"{truth['held_out_pixels']} held-out pixels. Shares in percent at {' / '.join(counts)} views",
             soft_wrap=True,
+            markup=False,
         )
         table = Table(box=None, pad_edge=False, header_style="bold")
         end_use = list(cases[0].get("end_use", {}))

@@ -216,12 +216,17 @@ def print_benchmark(found: dict[str, Any], *, to_stderr: bool) -> None:
     trees = [case["metrics"] for case in found["cases"]]
     columns, differences = table_figures(*trees), difference_figures(*trees)
     if comparison["paired_datasets"]:
-        table = _table(f"differences to {comparison['baseline']}, mean over sequences [95 % interval]")
+        table = _table(
+            f"differences to {escape(comparison['baseline'])}, mean over sequences [95 % interval]"
+        )
         for column in ("dataset", "profile", "method", "sequences", *differences):
             table.add_column(column)
         for row in comparison["paired_datasets"]:
             about = (row["dataset"], row["profile"], row["method"], str(row["n_sequences"]))
-            table.add_row(*about, *(difference_text(name, row["figures"].get(name)) for name in differences))
+            table.add_row(
+                *map(escape, about),
+                *(difference_text(name, row["figures"].get(name)) for name in differences),
+            )
         out.print(table)
     table = _table("mean ± standard deviation over seeds")
     for column in ("sequence", "profile", "method", "seeds", *columns):
@@ -229,7 +234,8 @@ def print_benchmark(found: dict[str, Any], *, to_stderr: bool) -> None:
     for row in comparison["sequences"]:
         name = f"{row['sequence']}@{row['setting']}" if row["setting"] else row["sequence"]
         figures = (spread_text(metric, row["figures"].get(metric)) for metric in columns)
-        table.add_row(name, row["profile"], row["method"], str(row["n_seeds"]), *figures)
+        about = (name, row["profile"], row["method"], str(row["n_seeds"]))
+        table.add_row(*map(escape, about), *figures)
     out.print(table)
     for words in found["regressions"]:
         out.print(f"[red]worse: {escape(words)}[/]")

@@ -8,7 +8,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from extrags.errors import ConfigError, DamagedArtefactError, StoreError
-from flows.commands.common import counted, store_root, write_json
+from flows.commands.common import counted, existing_store, set_up_logging, write_json
 from flows.commands.options import Parser, add_json, add_store, add_verb
 from flows.commands.status import size_text
 
@@ -85,11 +85,12 @@ def ls(given: argparse.Namespace) -> int:
     Raises:
         StoreError: when there is no such store.
     """
+    from rich.markup import escape
     from rich.table import Table
 
     from flows.terminal import console
 
-    store = _existing_store(given)
+    store = _looked_into(given)
     manifests = store.ls(given.pattern)
     damaged = [item.key for item in manifests if given.verify and store.examine(item.key)]
     if given.json != "-":
@@ -103,7 +104,8 @@ def ls(given: argparse.Namespace) -> int:
         for item in manifests:
             mark = " [red]DAMAGED[/]" if item.key in damaged else ""
             cost = (f"{item.seconds:.1f}", size_text(item.bytes))
-            table.add_row(item.stage, item.label, item.started[:16], *cost, item.key + mark)
+            names = (escape(item.stage), escape(item.label), escape(item.started[:16]))
+            table.add_row(*names, *cost, escape(item.key) + mark)
         out = console()
         out.print(table)
         total = size_text(sum(item.bytes for item in manifests))
@@ -127,7 +129,7 @@ def verify(given: argparse.Namespace) -> int:
 
     from flows.terminal import console
 
-    store = _existing_store(given)
+    store = _looked_into(given)
     checked, damaged = _examined(store)
     aside = [store.set_aside(damage) if given.repair else None for damage in damaged]
     if given.json != "-":
@@ -181,7 +183,7 @@ def rm(given: argparse.Namespace) -> int:
     Raises:
         StoreError: when there is no such store, or nothing in it matches.
     """
-    store = _existing_store(given)
+    store = _looked_into(given)
     removed = [key for pattern in given.patterns for key in store.rm(pattern)]
     if not removed:
         raise StoreError(
@@ -202,12 +204,13 @@ def usage(given: argparse.Namespace) -> int:
     """
     from dataclasses import asdict
 
+    from rich.markup import escape
     from rich.table import Table
 
     from extrags.store.retention import usage as usage_of
     from flows.terminal import console
 
-    store = _existing_store(given)
+    store = _looked_into(given)
     rows = usage_of(store)
     if given.json != "-":
         table = Table(box=None, pad_edge=False, header_style="bold")
@@ -218,7 +221,7 @@ def usage(given: argparse.Namespace) -> int:
             table.add_column(column, no_wrap=True)
         for row in rows:
             numbers = (str(row.artefacts), str(row.files), size_text(row.bytes))
-            table.add_row(row.sequence, *numbers, row.made[:16], row.used[:16])
+            table.add_row(escape(row.sequence), *numbers, row.made[:16], row.used[:16])
         out = console()
         out.print(table)
         total = ", ".join(
@@ -248,7 +251,7 @@ def gc(given: argparse.Namespace) -> int:
     max_bytes = None if given.max_size is None else size_bytes(given.max_size)
     if given.keep_last is not None and given.keep_last < 1:
         raise ConfigError(f"--keep-last {given.keep_last}: expected 1 or more")
-    store = _existing_store(given)
+    store = _looked_into(given)
     # Here, because they load Prefect, which wrong usage must not wait for.
     from tasks.locks import sweep_locks
     from tasks.stage import all_stage_versions
@@ -303,10 +306,11 @@ def size_bytes(text: str) -> int:
     return int(float(found[1]) * BYTES[found[2]])
 
 
-def _existing_store(given: argparse.Namespace) -> Store:
-    from extrags.store import Store
+def _looked_into(given: argparse.Namespace) -> Store:
+    """The store; what it warns of, such as damage, are log lines.
 
-    store = Store(store_root(given))
-    if not store.exists():
-        raise StoreError(f"there is no store {store.root}")
-    return store
+    Raises:
+        StoreError: when there is none.
+    """
+    set_up_logging(debug=given.debug, terminal=True, quiet=given.quiet)
+    return existing_store(given)

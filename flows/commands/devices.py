@@ -34,6 +34,7 @@ def devices(given: argparse.Namespace) -> int:
     left_out = METHODS[given.method].leave_out
     found = [item for item in placements(run_config(given)) if item.stage not in left_out]
     if given.json != "-":
+        from rich.markup import escape
         from rich.table import Table
 
         from flows.terminal import console
@@ -42,7 +43,7 @@ def devices(given: argparse.Namespace) -> int:
         for name in ("stage", "work", "device", "rasteriser", "why"):
             table.add_column(name)
         for item in found:
-            table.add_row(item.stage, item.work, item.device, item.rasteriser or "-", item.reason)
+            table.add_row(item.stage, item.work, item.device, item.rasteriser or "-", escape(item.reason))
         console().print(table)
     write_json([item.to_json() for item in found], given.json)
     return 0

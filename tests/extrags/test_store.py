@@ -259,6 +259,13 @@ class TestStore:
         assert [manifest.key for manifest in store.ls()] == ["toy-v1-b"]
         assert store.rm("toy") == ["toy-v1-b"]
 
+    def test_a_label_with_brackets_is_found_by_its_name(self, store: Store) -> None:
+        put(store, "toy-v1-a", label="scans [b]/case")
+        put(store, "toy-v1-b", label="scans b/case")
+        assert [manifest.key for manifest in store.ls("scans [b]/case")] == ["toy-v1-a", "toy-v1-b"]
+        assert store.rm("scans [b]/cas?") == ["toy-v1-b"]
+        assert store.rm("scans [b]/case") == ["toy-v1-a"]
+
     def test_nested_refs_survive_a_moved_store(self, tmp_path: Path) -> None:
         ref = put(Store(tmp_path / "first"))
         (tmp_path / "first").rename(tmp_path / "second")

@@ -353,6 +353,14 @@ class TestSetAside:
         assert place.store.find_or_set_aside(KEY) is None
         assert put(place.store).digest
 
+    @pytest.mark.parametrize("pattern", ["*", KEY, "toy"])
+    def test_a_damaged_manifest_is_removed_by_key_or_stage(self, pattern: str, place: Place) -> None:
+        put(place.store)
+        place.change(MANIFEST, flipped)
+        assert place.store.rm("phantom/*") == []
+        assert place.store.rm(pattern) == [KEY]
+        assert place.store.keys() == []
+
     def test_writing_the_same_again_replaces_a_damaged_artefact(self, place: Place) -> None:
         ref = put(place.store)
         place.change(CHUNK, flipped)

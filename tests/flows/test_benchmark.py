@@ -15,6 +15,7 @@ from extrags.config import profile_config
 from extrags.errors import ConfigError
 from extrags.store import Store
 from flows.benchmark import Case, benchmark, check_methods, run_method, summary_of
+from flows.commands.benchmark import print_benchmark
 from flows.limits import StageLimits
 from flows.outcome import SequenceOutcome
 from flows.runners import DirectRunner
@@ -268,3 +269,18 @@ class TestNames:
         assert spread_text("psnr", figure) == "1.50 ± 0.50"
         assert spread_text("psnr", {**figure, "deviation": None}) == "1.50"
         assert spread_text("psnr", None) == difference_text("psnr", None) == "–"  # noqa: RUF001
+
+
+def test_names_are_told_with_their_brackets(capsys: pytest.CaptureFixture[str]) -> None:
+    about = {"profile": "quick", "method": "dim [b]", "figures": {}}
+    comparison = {
+        "baseline": "[red]one",
+        "paired_datasets": [{**about, "dataset": "scans [c]", "n_sequences": 1}],
+        "sequences": [{**about, "sequence": "scans [d]/case", "setting": "", "n_seeds": 1}],
+    }
+    print_benchmark(
+        {"comparison": comparison, "cases": [], "regressions": [], "report": "page.html"}, to_stderr=False
+    )
+    said = capsys.readouterr().out
+    for name in ("dim [b]", "[red]one", "scans [c]", "scans [d]/case"):
+        assert name in said

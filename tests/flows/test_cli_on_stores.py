@@ -15,6 +15,7 @@ from flows.cases import SequenceCase, record_outcome
 from flows.cli import main
 from flows.outcome import SequenceOutcome, StageRow
 from flows.outcome_records import outcome_records
+from flows.run_costs import RunPrediction
 from tests.documented_json import undocumented
 from tests.flows.tiny import SEQUENCE, TINY, settled
 
@@ -159,8 +160,47 @@ class TestFinished:
         self, verb: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         more = ["-o", str(tmp_path / "x.ply")]
+        (tmp_path / "store").mkdir()
         assert main([verb, SEQUENCE, *settled(str(tmp_path / "store")), *more]) == 1
         assert "run it first" in capsys.readouterr().err
+
+    @pytest.mark.parametrize(
+        "arguments",
+        [
+            ["report", SEQUENCE],
+            ["export", SEQUENCE, "--output", "x.ply"],
+            ["evaluate", SEQUENCE],
+            ["compare", SEQUENCE],
+            ["gallery"],
+            ["leaderboard"],
+            ["status"],
+            ["cache", "ls"],
+        ],
+        ids=lambda words: words[0],
+    )
+    def test_a_verb_that_only_looks_makes_no_store(
+        self,
+        arguments: list[str],
+        tmp_path: Path,
+        capsys: pytest.CaptureFixture[str],
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> None:
+        monkeypatch.chdir(tmp_path)
+        assert main([*arguments, "--store", str(tmp_path / "none" / "store")]) == 1
+        said = capsys.readouterr().err
+        assert f"{tmp_path}/none/store" in said
+        assert "there is no" in said
+        assert list(tmp_path.iterdir()) == []
+
+    def test_a_cost_is_predicted_without_a_store(
+        self, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        predicted = RunPrediction([], "probe", 0)
+        monkeypatch.setattr("flows.run_costs.predict_run", lambda *_, **__: predicted)
+        given = [SEQUENCE, "--profile", "quick", "--before", "--store", str(tmp_path / "store")]
+        assert main(["plan", *given]) == 0
+        assert "predicted cost" in capsys.readouterr().out
+        assert list(tmp_path.iterdir()) == []
 
 
 class TestCache:
@@ -224,6 +264,32 @@ class TestCache:
         assert [manifest.key for manifest in Store(store).ls()] == ["toy-v1-1"]
         assert main(["cache", "rm", "toy-v1-1", "--store", store]) == 0
         assert "1 artefact removed" in capsys.readouterr().out
+
+    def test_labels_are_told_with_their_brackets(
+        self, store: str, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        label = "scans [b]/[red]case"
+        with Store(store).slot(stage="toy", version=1, key="toy-v1-x", label=label):
+            pass
+        for verb in ("ls", "usage"):
+            assert main(["cache", verb, "--store", store]) == 0
+            assert label in capsys.readouterr().out
+        assert main(["cache", "rm", label, "--store", store]) == 0
+        assert "toy-v1-x" in capsys.readouterr().out
+
+    def test_what_has_a_damaged_manifest(
+        self, store: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        (Path(store) / "artefacts" / "toy-v1-1" / "manifest.json").write_text("{")
+        # It is told as all log lines are, not as Prefect's.
+        told: list[str] = []
+        monkeypatch.setattr("flows.commands.cache.set_up_logging", lambda **_: told.append("log"))
+        for verb in ("ls", "usage", "gc"):
+            assert main(["cache", verb, "--store", store]) == 0
+        assert len(told) == 3
+        assert main(["cache", "rm", "toy-v1-1", "--store", store]) == 0
+        assert "1 artefact removed" in capsys.readouterr().out
+        assert not (Path(store) / "artefacts" / "toy-v1-1").exists()
 
     def test_rm_of_what_is_not_there(self, store: str, capsys: pytest.CaptureFixture[str]) -> None:
         assert main(["cache", "rm", "nosuch*", "--store", store]) == 1

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from extrags.errors import ConfigError
+from extrags.placement import Placement
 from extrags.stages import STAGES
 from flows.cli import main
 from flows.preflight import preflight
@@ -27,6 +28,15 @@ def test_every_stage_with_its_reason(tmp_path: Path, capsys: pytest.CaptureFixtu
     for stage in STAGES:
         assert stage in said
     assert "native" in said
+
+
+def test_reasons_are_told_with_their_brackets(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = Placement("coarse", "training", "cpu", "", "pip install -e '.[cuda]'")
+    monkeypatch.setattr("extrags.placement.placements", lambda _: [made])
+    assert main(["devices"]) == 0
+    assert "pip install -e '.[cuda]'" in capsys.readouterr().out
 
 
 def test_only_the_stages_of_the_method(capsys: pytest.CaptureFixture[str]) -> None:
