@@ -16,10 +16,14 @@ from extrags.errors import CaptureError, NonFiniteError, ShapeError, SourceError
 from extrags.output_files import whole_file
 from extrags.zarr_io import new_group, open_group, read_array, write_array
 
-__all__ = ["SH_C0", "Gaussians"]
+__all__ = ["COMPRESSED_PLY", "PACKED_PROPERTY", "SH_C0", "Gaussians"]
 
 SH_C0 = 0.28209479177387814
 """Value of the constant spherical harmonic."""
+
+PACKED_PROPERTY = "packed_position"
+"""By this a compressed PLY is known (`extrags.splat_files.compressed_ply`)."""
+COMPRESSED_PLY = "a compressed PLY, which is not read: export the scene as PLY or SPZ"
 
 _HIGHER = (0, 3, 8, 15)
 """SH coefficients above degree 0, by degree: files and kernels know no other."""
@@ -232,7 +236,7 @@ class Gaussians:
 
         Raises:
             SourceNotFoundError: when there is no such file.
-            SourceError: when it is damaged, or a field is missing.
+            SourceError: when it is damaged, a field is missing, or it is a compressed PLY.
         """
         if not Path(path).exists():
             raise SourceNotFoundError("no such file", file=path)
@@ -241,6 +245,8 @@ class Gaussians:
         except (OSError, ValueError) as error:
             raise SourceError(f"not a 3DGS PLY: {error}", file=path) from error
         names = set(vertex.dtype.names or ())
+        if PACKED_PROPERTY in names:
+            raise SourceError(COMPRESSED_PLY, file=path, field=PACKED_PROPERTY)
         required = [
             "x",
             "y",

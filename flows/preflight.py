@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Collection
+from pathlib import Path
 
 from extrags.config import PipelineConfig
 from extrags.errors import WeightsError
@@ -25,6 +26,7 @@ def preflight(config: PipelineConfig, until: str, leave_out: Collection[str] = (
         WeightsError: when weights are not there; says how to get them.
         MissingDependencyError: when a package is not there; says how to install it.
         SourceNotFoundError: when there is no such file as `imported.scene`.
+        SourceError: when it is of a format that is not read.
         ConfigError: when settings do not fit each other, the model or the machine, EXTRAGS_ISA names an
             instruction set that is not usable here, or a metric that a program registered does not work.
         ExtragsError: when the code a checkpoint needs does not start.
@@ -58,6 +60,10 @@ def preflight(config: PipelineConfig, until: str, leave_out: Collection[str] = (
 
         config.check_imported()
         scene_digest(config.imported)
+        # Here, because it loads torch, which looking up a deployment must not.
+        from extrags.splat_files.reading import splat_format
+
+        splat_format(Path(config.imported.scene).expanduser())
     if "enhance" not in wanted:
         return
     # Here, because they load torch, which looking up a deployment must not.

@@ -3,15 +3,47 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 import torch
 
 from extrags.errors import SourceError, SourceNotFoundError
+from extrags.gaussians import COMPRESSED_PLY, PACKED_PROPERTY
 from extrags.scene import Scene
 from extrags.splat_files.ply import read_ply_scene
 from extrags.splat_files.spz import read_spz
 
-__all__ = ["read_splat_file"]
+__all__ = ["read_splat_file", "splat_format"]
+
+_HEADER_BYTES = 1 << 16
+
+
+def splat_format(path: Path) -> Literal["ply", "spz"]:
+    """The format of a file of Gaussians by its content, without reading all of it.
+
+    Raises:
+        SourceNotFoundError: when there is no such file.
+        SourceError: when it is of neither format; names those that are written here and not read.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise SourceNotFoundError("no such file", file=path)
+    try:
+        with path.open("rb") as stream:
+            start = stream.read(_HEADER_BYTES)
+    except OSError as error:
+        raise SourceError(f"cannot be read: {error.strerror or error}", file=path) from error
+    if start[:2] == b"\x1f\x8b" or start[:4] == b"NGSP":
+        return "spz"
+    if start[:3] == b"ply":
+        if f" {PACKED_PROPERTY}".encode() in start.partition(b"end_header")[0]:
+            raise SourceError(COMPRESSED_PLY, file=path, field=PACKED_PROPERTY)
+        return "ply"
+    if start[:4] == b"PK\x03\x04":
+        raise SourceError(
+            "a zip archive, as SOG files are: neither is read; export the scene as PLY or SPZ", file=path
+        )
+    raise SourceError("neither PLY nor SPZ, by its first bytes", file=path)
 
 
 def read_splat_file(path: Path) -> Scene:
@@ -26,16 +58,7 @@ def read_splat_file(path: Path) -> Scene:
         SourceError: when it is neither, is damaged, or holds no Gaussians or not finite ones.
     """
     path = Path(path)
-    if not path.is_file():
-        raise SourceNotFoundError("no such file", file=path)
-    with path.open("rb") as stream:
-        start = stream.read(4)
-    if start[:2] == b"\x1f\x8b" or start == b"NGSP":
-        scene = Scene(read_spz(path))
-    elif start[:3] == b"ply":
-        scene = read_ply_scene(path)
-    else:
-        raise SourceError("neither PLY nor SPZ, by its first bytes", file=path)
+    scene = Scene(read_spz(path)) if splat_format(path) == "spz" else read_ply_scene(path)
     if not len(scene.gaussians):
         raise SourceError("it holds no Gaussians", file=path)
     for name, values in scene.gaussians.parameters().items():

@@ -14,10 +14,12 @@ from flows.interruption import until_told_to_stop
 if TYPE_CHECKING:
     from extrags.cameras import Cameras
     from extrags.scene import Scene
+    from extrags.stages import StageName
 
 __all__ = ["add_arguments", "view"]
 
-FILES = (".ply", ".spz")
+FILES = (".ply", ".spz", ".sog")
+"""SOG is not read: the reader says so, and what is."""
 
 
 def add_arguments(parser: Parser) -> None:
@@ -150,7 +152,8 @@ def _from_store(given: argparse.Namespace) -> _Shown:
     which = given.scene or "final"
     # Looking up stages is no progress.
     with observed(lambda _: None):
-        run = finished_run(given, "coarse" if which == "coarse" else "finetune")
+        until: StageName = "coarse" if which == "coarse" else "finetune"
+        run = finished_run(given, until, coarse_by="--scene coarse")
     coarse = run.refs["coarse"]
     # Where fine-tuning was left out, the coarse scene is the final one.
     scene = run.store.load(Scene, run.refs.get("finetune", coarse) if which == "final" else coarse)

@@ -7,13 +7,15 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
 from extrags.config import PipelineConfig
+from extrags.gaussians import Gaussians
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
-from extrags.splat_files import bake_recorded_light, write_spz
+from extrags.splat_files import bake_recorded_light, write_compressed_ply, write_sog, write_spz
 from extrags.store import Store
 from flows.cli import main
 from flows.outcome import SequenceOutcome
@@ -130,6 +132,8 @@ class TestCommand:
         ("arguments", "code", "message"),
         [
             (["none.ply"], 1, "no such file"),
+            (["{folder}/a.sog"], 1, "a zip archive, as SOG files are: neither is read; export the scene as"),
+            (["{folder}/a.ply"], 1, "a compressed PLY, which is not read: export the scene as PLY or SPZ"),
             (["{file}", "--imported.scene", "b.ply"], 2, "set twice"),
             (["{file}", "--units", "2", "--imported.scale", "3"], 2, "set twice"),
             (["{file}", "--units", "0"], 2, "imported.scale is 0"),
@@ -146,7 +150,10 @@ class TestCommand:
         tmp_path: Path,
         capsys: pytest.CaptureFixture[str],
     ) -> None:
-        given = [part.replace("{file}", str(theirs)) for part in arguments]
+        few = Gaussians.from_points(np.eye(3), np.zeros((3, 3)), np.ones(3))
+        write_sog(few, tmp_path / "a.sog")
+        write_compressed_ply(few, tmp_path / "a.ply")
+        given = [part.format(file=theirs, folder=tmp_path) for part in arguments]
         store = str(tmp_path / "store")
         assert main(["import", *given, "--sequence", SEQUENCE, "--store", store]) == code
         said = capsys.readouterr().err

@@ -94,6 +94,9 @@ class TestRefused:
     def test_a_file_that_is_not_there(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert main(["view", str(tmp_path / "none.ply")]) == 1
         assert "no such file" in capsys.readouterr().err
+        (tmp_path / "a.sog").write_bytes(b"PK\x03\x04")
+        assert main(["view", str(tmp_path / "a.sog")]) == 1
+        assert "export the scene as PLY or SPZ" in capsys.readouterr().err
 
     @pytest.mark.usefixtures("stand_in")
     def test_a_run_that_is_not_in_the_store(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

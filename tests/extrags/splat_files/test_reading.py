@@ -14,7 +14,7 @@ import torch
 from extrags.errors import SourceError, SourceNotFoundError
 from extrags.gaussians import Gaussians
 from extrags.scene import Scene
-from extrags.splat_files import read_splat_file, read_spz, write_spz
+from extrags.splat_files import read_splat_file, read_spz, write_compressed_ply, write_sog, write_spz
 
 
 def packed(content: bytes) -> bytes:
@@ -36,7 +36,11 @@ class TestRefused:
         ("content", "message"),
         [
             (b"", "neither PLY nor SPZ"),
-            (b"PK\x03\x04", "neither PLY nor SPZ"),
+            (
+                b"PK\x03\x04",
+                "a zip archive, as SOG files are: neither is read; export the scene as PLY or SPZ",
+            ),
+            (b"PK", "neither PLY nor SPZ"),
             (b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n", "property is missing"),
             (b"\x1f\x8b\x08\x00", "SPZ"),
             (packed(b"short"), "ends within its header"),
@@ -59,6 +63,18 @@ class TestRefused:
         with pytest.raises(SourceError, match=message) as found:
             read_splat_file(file)
         assert found.value.file == str(file)
+
+    def test_our_own_formats_that_are_not_read_are_named(self, few: Gaussians, tmp_path: Path) -> None:
+        write_sog(few, tmp_path / "a.sog")
+        write_compressed_ply(few, tmp_path / "a.ply")
+        with pytest.raises(SourceError, match=r"zip archive, as SOG.*export the scene as PLY or SPZ"):
+            read_splat_file(tmp_path / "a.sog")
+        for read in (read_splat_file, Gaussians.read_ply):
+            with pytest.raises(
+                SourceError, match=r"a compressed PLY.*export the scene as PLY or SPZ"
+            ) as found:
+                read(tmp_path / "a.ply")
+            assert found.value.file == str(tmp_path / "a.ply")
 
     def test_no_file(self, tmp_path: Path) -> None:
         for read in (read_splat_file, read_spz):
