@@ -14,7 +14,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from extrags.cameras import Cameras
-from extrags.errors import ConfigError, ShapeError, StoreError
+from extrags.errors import ConfigError, ExtragsError, ShapeError, StoreError
 from extrags.events import Progress, emit
 from extrags.exploration.coverage import direction_counts, training_coverage
 from extrags.output_files import whole_file
@@ -184,6 +184,9 @@ def _told_of(file: Path) -> Iterator[None]:
 
     try:
         yield
+    except ExtragsError:
+        # It names the file already.
+        raise
     except (OSError, FFmpegError, ValueError) as error:
         raise StoreError(f"{file} cannot be written as H.264: {error}") from error
 
