@@ -301,11 +301,11 @@ class TestFailures:
     def test_debug_may_stand_behind_any_verb(
         self, arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        def root(given: argparse.Namespace) -> str:
+        def looked_into(given: argparse.Namespace) -> None:
             assert given.debug
             raise ZeroDivisionError
 
-        monkeypatch.setattr("flows.commands.cache.store_root", root)
+        monkeypatch.setattr("flows.commands.cache._looked_into", looked_into)
         with pytest.raises(ZeroDivisionError):
             main([*arguments, "--store", str(tmp_path)])
 
