@@ -78,7 +78,7 @@ def list_all(given: argparse.Namespace) -> int:
             table.add_column(column, justify="right" if column == "frames" else "left")
         for item in sequences:
             table.add_row(
-                item.name,
+                escape(item.name),
                 str(item.frames),
                 f"{item.width}x{item.height}",
                 "yes" if item.has_depth else "no",
