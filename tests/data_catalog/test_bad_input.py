@@ -41,11 +41,6 @@ class TestFolder:
         assert caught.value.field == "file"
         assert isinstance(caught.value, FileNotFoundError)
 
-    def test_missing_depth(self, posed_folder) -> None:
-        (posed_folder / "depth" / "0004.npy").unlink()
-        with pytest.raises(SourceNotFoundError, match=r"frame rgb/0004\.png, field depth"):
-            read(posed_folder)
-
     def test_depth_of_a_format_that_is_not_read(self, posed_folder) -> None:
         """It was said to be missing."""
         for file in (posed_folder / "depth").iterdir():
