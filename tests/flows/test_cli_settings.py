@@ -30,7 +30,7 @@ def frames(tmp_path: Path) -> str:
 
 
 class TestSettingsOfOtherSources:
-    @pytest.mark.parametrize("arguments", [["run"], ["plan"], ["data", "check"], ["data", "show"]])
+    @pytest.mark.parametrize("arguments", [["run"], ["plan"], ["data", "show"]])
     def test_a_part_of_what_has_no_times(
         self, arguments: list[str], frames: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
@@ -39,6 +39,11 @@ class TestSettingsOfOtherSources:
         said = capsys.readouterr().err
         assert said.startswith("extrags: frames: ingest.start_s = 5 cut a video or a DICOM file by its times")
         assert said.count("\n") == 1
+
+    def test_a_check_of_what_has_no_times(self, frames: str, capsys: pytest.CaptureFixture[str]) -> None:
+        assert main(["data", "check", frames, "--ingest.start_s", "5"]) == 1
+        said = capsys.readouterr().out
+        assert f"{frames}: frames: ingest.start_s = 5 cut a video or a DICOM file by its times" in said
 
     @pytest.mark.parametrize("verb", ["run", "plan"])
     def test_a_distance_for_given_poses(
