@@ -69,9 +69,23 @@ def restorer_words(provenance: Mapping[str, Any]) -> str:
     """
     if "backend" not in provenance:
         return ""
+    score = provenance.get("domain_score")
+    return _judged_words(provenance) + ("" if score is None else f" {_domain_words(float(score))}")
+
+
+def _domain_words(score: float) -> str:
+    place = f"{number(score, 2)} times as far from those the network was trained on as the limit"
+    if score > 1:
+        return f"The frames of this scene are {place}: they are not what it knows."
+    return f"The frames of this scene are {place}: they are like what it knows."
+
+
+def _judged_words(provenance: Mapping[str, Any]) -> str:
     said = f"Restored by {provenance['backend']}."
     judged = provenance.get("judged")
     if not judged:
+        if provenance["backend"] == "classical" and provenance.get("reason"):
+            return f"Restored by blending and filling: {provenance['reason']}."
         return said
     restored, filled = (number(judged[name], 2) for name in ("restored_db", "filled_db"))
     if provenance["backend"] == "classical":

@@ -36,10 +36,13 @@ class ClassicalEnhancer:
         reason: why it replaces another restorer; empty where it was asked for.
         judged: what both reached on left-out frames, `{restored_db, filled_db, error_over_expected}`; None
             where they were not compared.
+        domain_score: how far the scene is from what the restorer that it replaces was trained on
+            (`extrags.restoration.uncertainty.domain`); None where that is not known.
     """
 
     reason: str = ""
     judged: Mapping[str, float | None] | None = None
+    domain_score: float | None = None
 
     name = "classical"
     follows_keyframes = True
@@ -57,7 +60,11 @@ class ClassicalEnhancer:
 
     @property
     def _description(self) -> dict[str, Any]:
-        said = {"reason": self.reason or None, "judged": None if self.judged is None else dict(self.judged)}
+        said = {
+            "reason": self.reason or None,
+            "judged": None if self.judged is None else dict(self.judged),
+            "domain_score": self.domain_score,
+        }
         return {"backend": self.name, **{name: value for name, value in said.items() if value is not None}}
 
 
@@ -93,7 +100,10 @@ class ClassicalBackend:
         with description_fields(file):
             reason = text_field(description, "reason") if "reason" in description else ""
             judged = description.get("judged")
-            return ClassicalEnhancer(reason, None if judged is None else dict(judged))
+            score = description.get("domain_score")
+            return ClassicalEnhancer(
+                reason, None if judged is None else dict(judged), None if score is None else float(score)
+            )
 
 
 CLASSICAL = ClassicalBackend()

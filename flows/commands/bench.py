@@ -275,6 +275,14 @@ def _print_restorers(cases: list[dict[str, Any]]) -> None:
             soft_wrap=True,
             markup=False,
         )
+        for case in chosen:
+            if case["domain_score"] is not None:
+                place = "unlike" if case["domain_score"] > 1 else "like"
+                console().print(
+                    f"{case['method']}: domain score {case['domain_score']:.2f}, {place} its training data",
+                    soft_wrap=True,
+                    markup=False,
+                )
         rows = []
         for case in chosen:
             calibration, kept = case["calibration"], case["kept"]

@@ -250,8 +250,8 @@ def compare_methods(
         lpips: LPIPS by backbone; None leaves it out.
 
     Returns:
-        One case per method: `{sequence, seed, method, steps, psnr, ssim, lpips_alex, well, hole, ...,
-        seconds_per_frame, prepare_seconds, keyframes, keyframe_seconds, pixel_share, views}`; see
+        One case per method: `{sequence, seed, method, steps, domain_score, psnr, ssim, lpips_alex, well,
+        hole, ..., seconds_per_frame, prepare_seconds, keyframes, keyframe_seconds, pixel_share, views}`; see
         `RestorerBenchmark.figures`.
 
     Raises:
@@ -282,6 +282,7 @@ def compare_methods(
                 "seed": config.enhance.seed,
                 "method": name,
                 "steps": restored.provenance.get("steps"),
+                "domain_score": restored.provenance.get("domain_score"),
                 **figures,
                 "prepare_seconds": seconds,
                 "keyframes": len(keyframes),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from extrags.depth.hidden import depth_from_image
 from extrags.depth.weights import hidden_digest, load_hidden
 from extrags.errors import ConfigError, WeightsError
 from extrags.restoration.description import description_fields, read_description, write_description
+from extrags.restoration.diffusion.frame_features import sequence_features
 from extrags.restoration.diffusion.network import RestorationNetwork, build_network
 from extrags.restoration.diffusion.precision import chosen_precision
 from extrags.restoration.diffusion.rectified_flow import Sampled, sample
@@ -28,6 +29,7 @@ from extrags.restoration.protocol import Clip, Restoration
 from extrags.restoration.uncertainty.calibration import Calibration
 from extrags.restoration.uncertainty.domain import Domain
 from extrags.restoration.uncertainty.error_model import ErrorModel, error_features
+from extrags.sequence import EndoscopicSequence
 from extrags.threads import in_threads
 from extrags.view_synthesis.conditioning import (
     COLOR_CENTER,
@@ -43,13 +45,16 @@ from extrags.view_synthesis.references import LightTransfer
 
 __all__ = ["EmbeddedEnhancer", "pretrained"]
 
-FORMAT = 4
+FORMAT = 5
 """Raised when a saved restorer cannot be read by newer code."""
-ADDED_ENTRIES: dict[int, dict[str, Any]] = {
-    2: {"generative": False, "drawing": False, "domain": None, "depth_from_image": None},
-    3: {"depth_from_image": None},
+_UNKNOWN_DOMAIN: dict[str, Any] = {"domain": None, "domain_score": None, "scene_calibrated": False}
+EARLIER_FORMATS: dict[int, dict[str, Any]] = {
+    2: {"generative": False, "drawing": False, "depth_from_image": None, **_UNKNOWN_DOMAIN},
+    3: {"depth_from_image": None, **_UNKNOWN_DOMAIN},
+    4: _UNKNOWN_DOMAIN,
 }
-"""What earlier formats that can be read lack, and what stands for it."""
+"""What stands for what earlier formats that can be read lack, or have of another kind: the domain, of other
+features."""
 PATCHES = "patches.safetensors"
 COLOR_STEPS = 255
 CHANNELS_OF_NETWORKS = (CONDITION_CHANNELS, CONDITION_CHANNELS + INVENTED_CHANNELS)
@@ -81,6 +86,9 @@ class EmbeddedEnhancer:
             [R, 3, S, S]; None without.
         domain: what it was trained on, by which a scene is told to be of that world or not; None where that
             is not known.
+        domain_score: how far the scene's frames are from that: above 1 outside; None where that is not known,
+            and before there is a scene.
+        scene_calibrated: the calibration is that of the scene's left-out frames.
         depth_from_image: depth in holes is read from the restored image.
     """
 
@@ -98,6 +106,8 @@ class EmbeddedEnhancer:
     patches: Float[Tensor, "r 3 s s"] | None = None
     domain: Domain | None = None
     depth_from_image: bool = False
+    domain_score: float | None = None
+    scene_calibrated: bool = False
 
     name = "embedded"
     follows_keyframes = True
@@ -230,25 +240,23 @@ class EmbeddedEnhancer:
         generator = np.random.default_rng([self.seed, 3, clip, index])
         return torch.from_numpy(generator.standard_normal((1, 3, height, width), dtype=np.float32))
 
-    def described(self, patches: Float[Tensor, "r 3 s s"]) -> Float[np.ndarray, "r c"]:
-        """Features of patches that tell one world from another; for generative networks."""
-        with torch.no_grad():
-            return np.asarray(
-                self.network.texture.describe((patches.float() - COLOR_CENTER) / COLOR_SCALE).double()
-            )
+    def with_domain_score(self, sequence: EndoscopicSequence) -> EmbeddedEnhancer:
+        """The same restorer, told how far a scene is from what it was trained on, if that is known.
 
-    @cached_property
-    def domain_score(self) -> float | None:
-        """How far the scene is from what was trained on: above 1 outside; None where that is not known."""
-        if self.domain is None or self.patches is None:
-            return None
-        return self.domain.score(self.described(self.patches))
+        Args:
+            sequence: with training frames.
+        """
+        if self.domain is None:
+            return self
+        features = sequence_features(self.network, sequence)
+        return replace(self, domain_score=self.domain.score(features) if len(features) else None)
 
     @property
     def modesty(self) -> float:
-        """Factor of the expected error outside the known world."""
-        score = self.domain_score
-        return 1.0 if score is None else min(max(score, 1.0), MOST_MODESTY)
+        """Factor of the expected error outside the known world, where no frame of the scene has told it."""
+        if self.domain_score is None or self.scene_calibrated:
+            return 1.0
+        return min(max(self.domain_score, 1.0), MOST_MODESTY)
 
     def _patch_features(self) -> PatchFeatures | None:
         if self.patches is None or not self.network.generative:
@@ -311,6 +319,8 @@ class EmbeddedEnhancer:
             # The weights that read it are not saved: cached views follow their digest.
             "depth_from_image": hidden_digest() if self.depth_from_image else None,
             "domain": None if self.domain is None else self.domain.as_dict(),
+            "domain_score": self.domain_score,
+            "scene_calibrated": self.scene_calibrated,
             "record": self.record,
         }
         write_description(path, description)
@@ -331,17 +341,17 @@ class EmbeddedEnhancer:
             raise WeightsError(f"{weights_file}: no such file; train the restorer first (stage enhance)")
         description = read_description(description_file)
         channels = description.get("condition_channels")
-        for number, entries in ADDED_ENTRIES.items():
+        for number, entries in EARLIER_FORMATS.items():
             if description.get("format") == number:
-                description = entries | description
-        if description.get("format") not in (*ADDED_ENTRIES, FORMAT) or (
+                description = entries | description | _UNKNOWN_DOMAIN
+        if description.get("format") not in (*EARLIER_FORMATS, FORMAT) or (
             channels not in CHANNELS_OF_NETWORKS
         ):
             readable = " or ".join(map(str, CHANNELS_OF_NETWORKS))
             raise WeightsError(
                 f"{description_file}: format {description.get('format')} with {channels} channels, this "
-                f"version reads formats {min(ADDED_ENTRIES)} to {FORMAT} with {readable}; train the restorer "
-                "again"
+                f"version reads formats {min(EARLIER_FORMATS)} to {FORMAT} with {readable}; train the "
+                "restorer again"
             )
         with description_fields(description_file):
             first, second, third = description["widths"]
@@ -367,6 +377,8 @@ class EmbeddedEnhancer:
                 _read_patches(weights_file.with_name(PATCHES)),
                 None if description["domain"] is None else Domain.from_dict(description["domain"]),
                 bool(description["depth_from_image"]),
+                None if description["domain_score"] is None else float(description["domain_score"]),
+                bool(description["scene_calibrated"]),
             )
         try:
             network.load_state_dict(

@@ -32,7 +32,9 @@ def with_calibration(enhancer: EmbeddedEnhancer, restored: RestoredPairs) -> Emb
         restored: what it makes of the validation pairs.
     """
     calibration = Calibration.fitted(*cell_errors(restored))
-    return replace(enhancer, calibration=calibration) if calibration.predicted else enhancer
+    if not calibration.predicted:
+        return enhancer
+    return replace(enhancer, calibration=calibration, scene_calibrated=True)
 
 
 def error_over_expected(enhancer: EmbeddedEnhancer, restored: RestoredPairs) -> float | None:

@@ -148,11 +148,7 @@ class RestorationNetwork(nn.Module):
         embedded = self.time(_sinusoids(time))
         if self.generative and drawing is not None:
             embedded = embedded + self.drawing(drawing[:, None])
-        packed = functional.pixel_unshuffle(torch.cat([condition, noisy], dim=1), UNSHUFFLE)
-        entered = self.entrance(packed.contiguous(memory_format=torch.channels_last))
-        fine = self.down_fine(entered, embedded)
-        middle = self.down_middle(self.to_middle(fine), embedded)
-        coarse = self.down_coarse(self.to_coarse(middle), embedded)
+        entered, fine, middle, coarse = self._encoded(condition, noisy, embedded)
         coarse = self.attention(coarse)
         taken = self.texture(coarse, patches) if self.generative and patches is not None else None
         coarse = self.up_coarse(coarse if taken is None else coarse + taken.coarse, embedded)
@@ -167,6 +163,25 @@ class RestorationNetwork(nn.Module):
         hidden = self.up_last(torch.cat([hidden, entered], dim=1), embedded)
         hidden = self.exit(functional.silu(self.norm(hidden)))
         return functional.pixel_shuffle(hidden, UNSHUFFLE)
+
+    def coarsest(
+        self,
+        condition: Float[Tensor, "n c h w"],
+        noisy: Float[Tensor, "n 3 h w"],
+        time: Float[Tensor, "n"],
+    ) -> Float[Tensor, "n d h8 w8"]:
+        """Features at an eighth of the size, before places look at each other; arguments as of `forward`."""
+        return self._encoded(condition, noisy, self.time(_sinusoids(time)))[-1]
+
+    def _encoded(
+        self, condition: Tensor, noisy: Tensor, time: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """At the entrance, and at the fine, middle and coarsest level."""
+        packed = functional.pixel_unshuffle(torch.cat([condition, noisy], dim=1), UNSHUFFLE)
+        entered = self.entrance(packed.contiguous(memory_format=torch.channels_last))
+        fine = self.down_fine(entered, time)
+        middle = self.down_middle(self.to_middle(fine), time)
+        return entered, fine, middle, self.down_coarse(self.to_coarse(middle), time)
 
     def initialise(self, generator: torch.Generator) -> None:
         """Draw all weights from one generator; residual branches and output start at zero."""

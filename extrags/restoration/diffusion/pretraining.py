@@ -27,6 +27,7 @@ from extrags.errors import ConfigError, WeightsError
 from extrags.metrics.lpips import Lpips
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.diffusion.error_fit import with_error_model
+from extrags.restoration.diffusion.frame_features import frame_features
 from extrags.restoration.diffusion.network import SIZE_MULTIPLE, RestorationNetwork, build_network
 from extrags.restoration.diffusion.network_training import NetworkTraining, TrainingSettings
 from extrags.restoration.diffusion.precision import has_fast_half_precision
@@ -47,7 +48,7 @@ __all__ = ["PretrainingConfig", "check_settings", "pretrain"]
 
 ANY_HUE = Gamut(0.0, 1e6, 0.0, 1e6)
 MAX_STEPS = 4
-DOMAIN_PATCHES = 8
+SCORED_PATCHES = 8
 """Patches per scene that tell what the network has learned from."""
 SETTINGS = "settings"
 """Name in a checkpoint of the settings of its training."""
@@ -176,7 +177,7 @@ def pretrain(
         network, 1, 1, config.seed, half, ANY_HUE, record, deterministic=config.deterministic
     )
     kept, unseen = files[: -config.validation_scenes], files[-config.validation_scenes :]
-    return replace(_scored(trained, unseen, config), domain=_domain(trained, kept, unseen, config))
+    return replace(_scored(trained, unseen, config), domain=_domain(trained, kept, unseen))
 
 
 def check_settings(config: PretrainingConfig, start: EmbeddedEnhancer | None) -> torch.device:
@@ -358,19 +359,16 @@ def _scored(enhancer: EmbeddedEnhancer, files: Sequence[Path], config: Pretraini
 def _patches(scene: PretrainingScene, config: PretrainingConfig, number: int) -> Float[Tensor, "r 3 s s"]:
     generator = np.random.default_rng([config.seed, 7, number])
     given = scene.references
-    return random_patches(given.images, given.valid, DOMAIN_PATCHES, config.patch_px, generator)
+    return random_patches(given.images, given.valid, SCORED_PATCHES, config.patch_px, generator)
 
 
-def _domain(
-    enhancer: EmbeddedEnhancer, trained: Sequence[Path], unseen: Sequence[Path], config: PretrainingConfig
-) -> Domain | None:
-    """What the network was trained on, as its patch encoder sees it; None where it has none."""
-    if not enhancer.network.generative:
-        return None
+def _domain(enhancer: EmbeddedEnhancer, trained: Sequence[Path], unseen: Sequence[Path]) -> Domain | None:
+    """What the network was trained on, as it sees it; None where no frame shows tissue."""
 
-    def features(file: Path, number: int) -> Float[np.ndarray, "r c"]:
-        return enhancer.described(_patches(PretrainingScene.load(file), config, number))
+    def features(file: Path) -> Float[np.ndarray, "r c"]:
+        given = PretrainingScene.load(file).references
+        return frame_features(enhancer.network, given.images.float(), given.valid)
 
-    known = [features(file, number) for number, file in enumerate(trained)]
-    others = [features(file, len(trained) + number) for number, file in enumerate(unseen)]
-    return Domain.fitted(np.concatenate(known), others)
+    known = np.concatenate([features(file) for file in trained])
+    others = [found for found in map(features, unseen) if len(found)]
+    return Domain.fitted(known, others) if len(known) else None

@@ -26,7 +26,7 @@ from extrags.view_synthesis.gamut import Frame, Gamut
 from extrags.view_synthesis.gather import gather_references
 from extrags.view_synthesis.references import LightTransfer
 
-__all__ = ["better_of_both", "scene_restorer"]
+__all__ = ["better_of_both", "by_domain", "scene_restorer"]
 
 MAX_LOSS_DB = 0.5
 """A PSNR lower by up to so much is accepted: leave-out views are near the path, with little to restore."""
@@ -48,10 +48,17 @@ def scene_restorer(
     start = pretrained(config)
     transfer = gather_references(scene, sequence, sequence.train).transfer
     patches = choose_patches(sequence) if start is not None and start.network.generative else None
+    if start is not None:
+        start = start.with_domain_score(sequence)
+        _tell_domain(start)
     if start is not None and config.train_iterations == 0:
         untouched = start.with_settings(config, _scene_gamut(sequence), patches)
-        if not config.judge or len(sequence.train) < MIN_FRAMES:
+        if not config.judge:
             return untouched
+        if len(sequence.train) < MIN_FRAMES:
+            return by_domain(
+                untouched, f"{len(sequence.train)} training frames are too few to leave some out"
+            )
         # Nothing is trained, so all leave-out pairs validate; synthetic ones would favour filling holes.
         leave_out = config.model_copy(update={"synthetic_views": 0})
         fresh = make_pairs(scene, sequence, leave_out, coarse, most=config.judge_pairs)
@@ -89,8 +96,7 @@ def better_of_both(
     """
     chosen = validation_pairs(pairs)
     if not bool((pairs.weight > 0).any()):
-        logger.warning("the restorer is not judged: no pair has a valid pixel")
-        return enhancer
+        return by_domain(enhancer, "no left-out frame has a valid pixel")
     # By their means: a drawn view has texture of its own, which costs PSNR wherever it is right.
     means = restored_pairs(replace(enhancer, drawing=False), chosen or pairs, transfer)
     scores = scores_of([means], transfer)
@@ -108,26 +114,50 @@ def better_of_both(
         "error_over_expected": None if ratio is None else round(ratio, 3),
     }
     score = enhancer.domain_score
-    tolerated = MAX_LOSS_DB
-    if score is not None:
-        emit(MetricRecorded("enhance", "domain_score", score))
-        if score > 1:
-            # Nothing says that it does better far from the path than near it.
-            tolerated = 0.0
-            logger.warning(
-                "this scene is unlike what the restorer was trained on (%.1f times as far as it should be)",
-                score,
-            )
+    # Outside of what it knows, nothing says that it does better far from the path than near it.
+    tolerated = MAX_LOSS_DB if score is None or score <= 1 else 0.0
     if restored < filled - tolerated:
         reason = (
             f"on leave-out pairs of this scene the embedded restorer reaches {restored:.2f} dB, blending and "
             f"filling {filled:.2f} dB"
         )
         logger.warning("%s; the scene is restored by blending and filling", reason)
-        return ClassicalEnhancer(reason, judged)
+        return ClassicalEnhancer(reason, judged, score)
     validation = {**enhancer.record.get("validation", {}), **scores}
     kept = replace(enhancer, record={**enhancer.record, "validation": validation, "judged": judged})
     return with_calibration(kept, shown) if calibrate and chosen is not None else kept
+
+
+def by_domain(enhancer: EmbeddedEnhancer, unjudged: str) -> Enhancer:
+    """The restorer where nothing can be left out to judge it, or the classical one on an unfamiliar scene.
+
+    Args:
+        enhancer: ready for the scene.
+        unjudged: why it is not judged, for the log and the artefact.
+    """
+    score = enhancer.domain_score
+    if score is None or score <= 1:
+        logger.warning("the restorer is not judged: %s", unjudged)
+        return enhancer
+    reason = (
+        f"{unjudged}, and this scene is unlike what the embedded restorer was trained on ({score:.1f} times "
+        "as far as unseen scenes of that kind are)"
+    )
+    logger.warning("%s; the scene is restored by blending and filling", reason)
+    return ClassicalEnhancer(reason, None, score)
+
+
+def _tell_domain(enhancer: EmbeddedEnhancer) -> None:
+    score = enhancer.domain_score
+    if score is None:
+        return
+    emit(MetricRecorded("enhance", "domain_score", score))
+    if score > 1:
+        logger.warning(
+            "this scene is unlike what the restorer was trained on (%.1f times as far as unseen scenes of "
+            "that kind are)",
+            score,
+        )
 
 
 def _scene_gamut(sequence: EndoscopicSequence) -> Gamut:

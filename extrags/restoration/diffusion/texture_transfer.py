@@ -24,7 +24,6 @@ KEY_WIDTH = 64
 INITIAL_SHARPNESS = 10.0
 PATCH_MULTIPLE = 8
 """Sides of patches must be multiples of this: one unshuffling, two halvings."""
-DEVIATION_FLOOR = 1e-4
 QUERIES_AT_ONCE = 4096
 """Bounds the memory of the similarities at full size."""
 
@@ -137,18 +136,6 @@ class TextureTransfer(nn.Module):
         values = places(coarse, 1)
         key = functional.normalize(self.key(values).float(), dim=-1)
         return PatchFeatures(key, values, places(middle, 2), places(fine, 4))
-
-    def describe(self, patches: Float[Tensor, "r 3 s s"]) -> Float[Tensor, "r c"]:
-        """What patches are like as a whole: means and log deviations of their features at each level.
-
-        Args:
-            patches: normalised as the network's colours are.
-        """
-        parts = []
-        for features in self.encoder(patches):
-            places = features.float().flatten(2)
-            parts += [places.mean(dim=2), (places.var(dim=2) + DEVIATION_FLOOR).log() / 2]
-        return torch.cat(parts, dim=1)
 
     def forward(self, coarse: Float[Tensor, "n c h w"], patches: PatchFeatures) -> Taken:
         """What the places of a view take."""

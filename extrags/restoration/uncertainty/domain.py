@@ -1,11 +1,11 @@
 r"""Whether a scene is of the world that the restorer has learned from.
 
-The patch encoder's features of real frames, their means and deviations over a patch, are taken for normally
-distributed over what was trained on. A patch's distance is Mahalanobis's in the leading directions,
+The network's features of real frames (`extrags.restoration.diffusion.frame_features`) are taken for normally
+distributed over what it was trained on. A frame's distance is Mahalanobis's in the leading directions,
 
 .. math:: d = \sqrt{\tfrac{1}{K} \sum_k (u_k^T (x - \mu))^2 / s_k^2} ,
 
-and a scene's score the median distance of its patches, divided by the one that 95 % of scenes stay below
+and a scene's score the median distance of its frames, divided by the one that 95 % of scenes stay below
 which were not trained on. Above one, the restorer is outside of what it knows.
 
 Source: Mahalanobis distance of deep features, [LeeDomain2018].
@@ -62,11 +62,11 @@ class Domain:
         trained: Float[np.ndarray, "n c"],
         unseen: Sequence[Float[np.ndarray, "m c"]],
     ) -> Domain:
-        """The distribution of the features of training patches.
+        """The distribution of the features of training frames.
 
         Args:
-            trained: of patches of scenes that were trained on.
-            unseen: of the patches of each scene that was not; they set the limit.
+            trained: of frames of scenes that were trained on.
+            unseen: of the frames of each scene that was not; they set the limit.
         """
         mean = trained.mean(axis=0)
         _, singular, directions = np.linalg.svd(trained - mean, full_matrices=False)
@@ -82,7 +82,7 @@ class Domain:
         """Distance of a scene from what was trained on, in units of the limit.
 
         Args:
-            features: of its patches, at least one.
+            features: of its frames, at least one.
         """
         along = (features - self.mean) @ self.directions.T / self.deviation
         return float(np.median(np.sqrt((along**2).mean(axis=1))) / self.limit)

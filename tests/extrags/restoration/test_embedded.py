@@ -3,6 +3,7 @@ from __future__ import annotations
 import copy
 import json
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from extrags.restoration.clips import render_clips
 from extrags.restoration.diffusion import scene_restorer
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.diffusion.error_fit import cell_errors, error_over_expected
+from extrags.restoration.diffusion.frame_features import sequence_features
 from extrags.restoration.diffusion.network import build_network
 from extrags.restoration.diffusion.network_training import (
     TrainingSettings,
@@ -33,6 +35,7 @@ from extrags.restoration.training_data.augmentation import Batch
 from extrags.restoration.training_data.pairs import Pairs
 from extrags.restoration.uncertainty import calibration
 from extrags.restoration.uncertainty.calibration import Calibration
+from extrags.restoration.uncertainty.domain import Domain
 from extrags.thresholds import HOLE_ALPHA
 from extrags.view_synthesis.conditioning import CONDITION_CHANNELS, Conditioning
 from extrags.view_synthesis.gamut import Gamut
@@ -300,6 +303,51 @@ class TestEmbedded:
         hidden = replace(tube_pairs, weight=torch.zeros_like(tube_pairs.weight))
         assert validation_pairs(hidden) is None
         assert better_of_both(trained, hidden, tube.references.transfer) is trained
+
+    def test_unjudged_it_serves_familiar_scenes_alone(
+        self, trained: EmbeddedEnhancer, tube_pairs: Pairs, tube: Tube, clip: Clip, tmp_path, caplog
+    ) -> None:
+        transfer = tube.references.transfer
+        hidden = replace(tube_pairs, weight=torch.zeros_like(tube_pairs.weight))
+        familiar, strange = (replace(trained, domain_score=score) for score in (0.9, 2.5))
+        assert better_of_both(familiar, hidden, transfer) is familiar
+        served = better_of_both(strange, hidden, transfer)
+        assert isinstance(served, ClassicalEnhancer)
+        assert "no left-out frame has a valid pixel" in caplog.text
+        served.save(tmp_path)
+        provenance = load_enhancer(tmp_path).restore(clip).provenance
+        assert "2.5 times as far" in provenance["reason"]
+        assert provenance["domain_score"] == 2.5
+
+    @pytest.mark.parametrize(("lost_db", "score", "kept"), [(0.3, 0.9, True), (0.3, 1.1, False)])
+    def test_on_unfamiliar_scenes_no_loss_is_tolerated(
+        self,
+        trained: EmbeddedEnhancer,
+        tube_pairs: Pairs,
+        tube: Tube,
+        monkeypatch,
+        lost_db: float,
+        score: float,
+        kept: bool,
+    ) -> None:
+        scores = {f"embedded_{trained.steps}": {"psnr": 20.0}, "classical": {"psnr": 20.0 + lost_db}}
+        monkeypatch.setattr(scene_restorer, "scores_of", lambda *_: scores)
+        served = better_of_both(replace(trained, domain_score=score), tube_pairs, tube.references.transfer)
+        assert isinstance(served, EmbeddedEnhancer) == kept
+
+    def test_with_too_few_frames_to_leave_out_unfamiliar_scenes_are_filled(
+        self, tube: Tube, tmp_path: Path, trained: EmbeddedEnhancer, monkeypatch
+    ) -> None:
+        monkeypatch.setattr(scene_restorer, "MIN_FRAMES", len(tube.sequence.train) + 1)
+        features = sequence_features(trained.network, tube.sequence)
+        settings = {"train_iterations": 0, "pretrained_weights": str(tmp_path), "judge": True}
+        for limit, kind in ((1e6, EmbeddedEnhancer), (1e-6, ClassicalEnhancer)):
+            domain = replace(Domain.fitted(features, []), limit=limit)
+            replace(trained, domain=domain).save(tmp_path)
+            served = train_enhancer(
+                tube.scene, tube.sequence, SMALL.model_copy(update=settings), CoarseConfig()
+            )
+            assert isinstance(served, kind)
 
     def test_validation_pairs_have_valid_pixels(self, tube_pairs: Pairs) -> None:
         chosen = np.flatnonzero(tube_pairs.validation)
