@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from pathlib import Path
@@ -51,6 +52,8 @@ ADDED_ENTRIES: dict[int, dict[str, Any]] = {
 }
 """What earlier formats that can be read lack, and what stands for it."""
 PATCHES = "patches.safetensors"
+UNTRAINED = "untrained"
+"""Folder inside that of a restorer."""
 COLOR_STEPS = 255
 CHANNELS_OF_NETWORKS = (CONDITION_CHANNELS, CONDITION_CHANNELS + INVENTED_CHANNELS)
 """Without and with channels of their own for what keyframes have invented."""
@@ -82,6 +85,8 @@ class EmbeddedEnhancer:
         domain: what it was trained on, by which a scene is told to be of that world or not; None where that
             is not known.
         depth_from_image: depth in holes is read from the restored image.
+        untrained: what the restorer was before it was trained on the scene; None where it was not, or began
+            with nothing.
     """
 
     network: RestorationNetwork
@@ -98,6 +103,7 @@ class EmbeddedEnhancer:
     patches: Float[Tensor, "r 3 s s"] | None = None
     domain: Domain | None = None
     depth_from_image: bool = False
+    untrained: EmbeddedEnhancer | None = None
 
     name = "embedded"
     follows_keyframes = True
@@ -275,7 +281,7 @@ class EmbeddedEnhancer:
         }
 
     def save(self, path: Path, *, half: bool = False) -> None:
-        """Write `restorer.safetensors` and `restorer.json`.
+        """Write `restorer.safetensors` and `restorer.json`, and a folder for what it was before, if anything.
 
         Args:
             path: a folder.
@@ -293,6 +299,9 @@ class EmbeddedEnhancer:
         (path / PATCHES).unlink(missing_ok=True)
         if self.patches is not None:
             save_file({"patches": (self.patches * COLOR_STEPS).round().to(torch.uint8)}, str(path / PATCHES))
+        shutil.rmtree(path / UNTRAINED, ignore_errors=True)
+        if self.untrained is not None:
+            self.untrained.save(path / UNTRAINED, half=half)
         description = {
             "backend": self.name,
             "format": FORMAT,
@@ -367,6 +376,7 @@ class EmbeddedEnhancer:
                 _read_patches(weights_file.with_name(PATCHES)),
                 None if description["domain"] is None else Domain.from_dict(description["domain"]),
                 bool(description["depth_from_image"]),
+                _read_untrained(weights_file.with_name(UNTRAINED)),
             )
         try:
             network.load_state_dict(
@@ -399,6 +409,10 @@ def _read_patches(file: Path) -> Float[Tensor, "r 3 s s"] | None:
         return load_safetensors(file)["patches"].float() / COLOR_STEPS
     except (OSError, RuntimeError, ValueError, KeyError) as error:
         raise WeightsError(f"{file}: not the patches of a scene's frames ({error})") from error
+
+
+def _read_untrained(folder: Path) -> EmbeddedEnhancer | None:
+    return EmbeddedEnhancer.load(folder) if folder.is_dir() else None
 
 
 def pretrained(config: EnhanceConfig) -> EmbeddedEnhancer | None:
