@@ -26,7 +26,7 @@ from extrags.evaluation import render
 from extrags.events import MetricRecorded, Progress, emit
 from extrags.metrics.image import psnr_per_image
 from extrags.pseudo_views import PseudoViews
-from extrags.restoration.protocol import Enhancer
+from extrags.restoration.protocol import Enhancer, never_trained_on
 from extrags.restoration.restored_renders import RestoredShares, restored_shares
 from extrags.restoration.trajectories import restored_batches
 from extrags.scene import Scene
@@ -174,7 +174,8 @@ def judge_finetuning(
         scene: the coarse scene, trained on `sequence.train`; trials are optimised where it is.
         sequence: posed frames; only training frames are used.
         trajectories: virtual views of each trajectory, its real start first.
-        enhancer: the scene's restorer; None where there are no virtual views.
+        enhancer: the scene's restorer; None where there are no virtual views. One that was trained on the
+            scene has learned from frames that are left out here: what it was before restores in its place.
         config: settings of the fine-tuning; None takes those of the profile `balanced`.
         enhance: settings of the restoration; None takes those of the profile `balanced`.
         coarse: settings the scene was reconstructed with; None takes those of the profile `balanced`.
@@ -196,6 +197,7 @@ def judge_finetuning(
         return Judgement(
             1.0, f"not judged: of {n_frames} training frames none can be left out (at least {MIN_FRAMES})"
         )
+    enhancer = None if enhancer is None else never_trained_on(enhancer)
     arms = list(_arms(scene, sequence, trajectories, enhancer, config, enhance, coarse, measure))
     if not arms:
         return Judgement(1.0, "not judged: no training frame that can be left out has a valid pixel")

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "MEMORY_TERMS",
+    "WORKLOAD_SETTINGS",
     "CostModel",
     "TaskCost",
     "Workload",
@@ -64,6 +65,40 @@ REWEIGHTED = 20
 PRIOR_RECORDS = 2.0
 """A task's own factor on a machine counts as much as that of all tasks when it rests on so many records."""
 PROBE_ROUNDS, PROBE_REPEATS = 12, 5
+
+WORKLOAD_SETTINGS = (
+    "coarse.iterations",
+    "coarse.sh_degree",
+    "coarse.max_points",
+    "coarse.pixels_per_point",
+    "coarse.densify.enabled",
+    "coarse.densify.max_gaussians",
+    "explore.score",
+    "explore.starts",
+    "explore.trajectories",
+    "explore.wave",
+    "enhance.backend",
+    "enhance.folds",
+    "enhance.fold_iterations",
+    "enhance.judge",
+    "enhance.judge_pairs",
+    "enhance.max_views",
+    "enhance.max_width",
+    "enhance.samples",
+    "enhance.steps",
+    "enhance.train_iterations",
+    "finetune.growth",
+    "finetune.iterations",
+    "finetune.keep_scene",
+    "finetune.rounds",
+    "finetune.judge.enabled",
+    "finetune.judge.iterations_share",
+    "finetune.judge.views",
+    "evaluate.lpips_nets",
+    "evaluate.restored",
+)
+"""All settings that predicted costs depend on: those that `Workload` reads, and those that say which tasks
+run and whether the coefficients hold of them. Without one of these, predictions are of other settings."""
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from extrags.config import AssessConfig, CoverageConfig, PipelineConfig
+from extrags.run_costs import WORKLOAD_SETTINGS
 from extrags.store import Ref, Slot
 from tasks.stage import stage
 
@@ -25,16 +26,8 @@ _OF_BUDGETS = (
 _OF_RESTORER = ("enhance.backend", "enhance.judge", "enhance.steps", "enhance.train_iterations")
 """Settings that say what will restore the virtual views."""
 
-_OF_SAVINGS = (
-    "coarse.densify.max_gaussians",
-    "enhance.folds",
-    "enhance.fold_iterations",
-    "enhance.max_width",
-    "finetune.growth",
-    "finetune.judge.enabled",
-    "finetune.judge.iterations_share",
-)
-"""Settings that what a stage costs depends on."""
+_OF_SAVINGS = tuple(name for name in WORKLOAD_SETTINGS if not name.startswith("evaluate."))
+"""Settings that what a stage costs depends on; nothing is decided on the evaluation."""
 
 
 def measuring_settings(config: AssessConfig) -> AssessConfig:
@@ -74,7 +67,7 @@ def assess(
     slot.counts["lacking_share"] = found["lacking_share"]
 
 
-@stage("plan", version=7)
+@stage("plan", version=8)
 def plan(slot: Slot, measured: Ref, config: PipelineConfig) -> None:
     """Derive the plan from the measurements and the budgets of the run; writes `plan.json`."""
     from extrags.scene_plan import decide

@@ -54,7 +54,8 @@ class DepthView:
 def depth_view(sequence: EndoscopicSequence, frame: int, max_width: int) -> DepthView | None:
     """Prepare a frame; None where it has too little depth to be aligned.
 
-    The size is divided by a whole number: depth is picked, never mixed across a fold; colours are averaged.
+    The size is divided by a whole number, and so by blocks of pixels: colours are averaged over each, and
+    depth is that in its middle, never mixed across a fold.
 
     Args:
         sequence: with depth.
@@ -65,15 +66,9 @@ def depth_view(sequence: EndoscopicSequence, frame: int, max_width: int) -> Dept
         return None
     step = -(-sequence.width // max_width)
     height, width = sequence.height // step, sequence.width // step
-    middle = step // 2
-    picked = np.s_[middle : height * step : step, middle : width * step : step]
     K = sequence.K[frame].astype(np.float64, copy=True)
-    K[:2, 2] = (K[:2, 2] - middle - 0.5) / step + 0.5
-    K[0, 0] /= step
-    K[1, 1] /= step
-    depth = sequence.depth_mm[frame][picked].astype(np.float64)
-    valid = sequence.mask[frame][picked] & np.isfinite(depth) & (depth > 0)
-    depth = np.where(valid, depth, 0)
+    K[:2] /= step
+    depth, valid = _middle_depth(sequence.depth_mm[frame], sequence.mask[frame], step)
     pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1)
     points = depth[..., None] * unproject_pixels(pixels, K)
     normals = _normals(points, depth, valid)
@@ -90,6 +85,25 @@ def depth_view(sequence: EndoscopicSequence, frame: int, max_width: int) -> Dept
     return DepthView(
         K, points, normals, valid, texture, textured, usable[spread], float(np.median(depth[valid]))
     )
+
+
+def _middle_depth(
+    depth: Float[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"], step: int
+) -> tuple[Float[np.ndarray, "rows columns"], Bool[np.ndarray, "rows columns"]]:
+    """Depth in the middle of each block of `step` x `step` pixels, 0 where unknown, and where it is known.
+
+    Blocks of an odd number of pixels have a middle one. In others four pixels meet in the middle: one of them
+    would be half a pixel off the block's colours, to another side in a frame that is rolled.
+    """
+    height, width = (size // step * step for size in depth.shape)
+    known = mask & np.isfinite(depth) & (depth > 0)
+    # Of a plane, the inverse depth is linear in the image.
+    inverse = np.where(known, 1 / np.where(known, depth, 1).astype(np.float64), 0)
+    around = range((step - 1) // 2, step // 2 + 1)
+    parts = np.stack([inverse[i:height:step, j:width:step] for i in around for j in around])
+    mean = parts.mean(axis=0)
+    valid = (parts > 0).all(axis=0) & (np.ptp(parts, axis=0) < EDGE_SHARE * mean)
+    return np.where(valid, 1 / np.where(valid, mean, 1), 0), valid
 
 
 def _normals(points: np.ndarray, depth: np.ndarray, valid: np.ndarray) -> np.ndarray:

@@ -49,8 +49,8 @@ class PoseEstimate:
         metric: true when the unit is the millimetre.
         report: counts of features, matches and registrations, ready for JSON.
         truth_per_unit: length of one unit of the poses in the unit of withheld true depth; None where no
-            depth is withheld or the poses are metric. The evaluation compares with the truth by it; no
-            pose and no point depends on it.
+            depth is withheld, where the ratio is not known, and where both are the millimetre. The
+            evaluation compares with the truth by it; no pose and no point depends on it.
         depth_factor: from the unit of the sequence's own depth to that of the poses; None where it is not
             known: that depth cannot be used with them.
         scale_source: what makes the estimate metric, if anything does.
@@ -351,6 +351,8 @@ def _by_depth(
         mean_reprojection_px=None,
         metric=scale_source != "source",
         report=report,
+        # True depth is in the unit of the sequence's own.
+        truth_per_unit=None if sequence.withheld_depth_mm is None or sequence.metric else 1 / depth_factor,
         depth_factor=depth_factor,
         scale_source=scale_source,
     )
@@ -391,7 +393,7 @@ def with_estimated_poses(
         return None if stack is None else frames_of(stack, kept)
 
     def of_truth(depth: np.ndarray | None) -> Any:
-        if depth is None or estimate.metric:
+        if depth is None or (estimate.metric and sequence.metric):
             return of_kept(depth)
         if estimate.truth_per_unit is None:
             return None  # its unit is not that of the poses, so that nothing could be compared with it

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,8 @@ class PoseUnit:
         length: of it, in the unit that poses and points are brought to; None leaves them as they are.
         scale_source: what makes that unit the millimetre, if anything does.
         depth_factor: from the unit of the sequence's own depth to that unit; None where it is not known.
-        truth_per_unit: length of a unit of the map in that of withheld true depth; None without such.
+        truth_per_unit: from the unit that poses are brought to, to that of withheld true depth; None without
+            such, where it is not known, and where both are the millimetre.
         report: numbers on it, ready for JSON; None where nothing makes it metric.
     """
 
@@ -56,14 +57,31 @@ def unit_of_map(
         result: the map.
         config: whether a working distance is given.
     """
+    unit = _unit_of_poses(sequence, poses, registered, result, config)
+    if sequence.withheld_depth_mm is None or (sequence.metric and unit.metric):
+        return unit
+    # A working distance that was told says nothing of the unit of the source.
+    seen = (result.observed_frame, result.observed_point, result.observed_px)
+    truth = depth_scale(poses, result.points, *seen, sequence.withheld_depth_mm, sequence.mask)
+    if truth is None:
+        return unit
+    return replace(unit, truth_per_unit=truth.mm_per_unit / (1.0 if unit.length is None else unit.length))
+
+
+def _unit_of_poses(
+    sequence: EndoscopicSequence,
+    poses: Float[np.ndarray, "f 4 4"],
+    registered: Bool[np.ndarray, "f"],
+    result: PoseJobResult,
+    config: PosesConfig,
+) -> PoseUnit:
+    """The same, from what may be known of the scale: of withheld depth nothing is."""
     seen = (result.observed_frame, result.observed_point, result.observed_px)
     working_distance_mm = config.working_distance_mm
-    scale = truth = None
+    scale = None
     if sequence.depth_mm is not None:
         # In the unit of the source, which may be any.
         scale = depth_scale(poses, result.points, *seen, sequence.depth_mm, sequence.mask)
-    elif sequence.true_depth_mm is not None and working_distance_mm is None:
-        truth = depth_scale(poses, result.points, *seen, sequence.true_depth_mm, sequence.mask)
     if scale is not None and sequence.metric:
         return PoseUnit(scale.mm_per_unit, "depth", report=asdict(scale))
     if working_distance_mm is None:
@@ -71,7 +89,6 @@ def unit_of_map(
             # Of no known unit, but of one with the depth.
             length=None if scale is None else scale.mm_per_unit,
             depth_factor=None if scale is None and sequence.depth_mm is not None else 1.0,
-            truth_per_unit=None if truth is None else truth.mm_per_unit,
         )
     typical = None
     if scale is not None and sequence.depth_mm is not None:

@@ -18,7 +18,7 @@ from extrags.sequence import EndoscopicSequence
 from extrags.view_synthesis.conditioning import Layers
 from extrags.view_synthesis.references import LightTransfer
 
-__all__ = ["Backend", "Clip", "Enhancer", "Restoration", "restore_clip", "restore_clips"]
+__all__ = ["Backend", "Clip", "Enhancer", "Restoration", "never_trained_on", "restore_clip", "restore_clips"]
 
 COLOR_ROUNDING = 1e-4
 """By so much colours may lie outside [0, 1]: half precision, and interpolation, round."""
@@ -85,7 +85,8 @@ class Enhancer(Protocol):
 
     `name` is that of the backend that loads it again. One that makes use of what keyframes have invented
     (`Layers.get("invented")`, folded into the base image of `condition`) says so by a further attribute
-    `follows_keyframes = True`; without it there are no keyframes.
+    `follows_keyframes = True`; without it there are no keyframes. One that was trained on frames of the scene
+    keeps what it was before as `untrained`: trials on left-out frames restore with that (`never_trained_on`).
     """
 
     @property
@@ -102,6 +103,19 @@ class Enhancer(Protocol):
         `extrags.restoration.description.write_description`.
         """
         ...
+
+
+def never_trained_on(enhancer: Enhancer) -> Enhancer:
+    """What restores in trials on frames of the scene, whose targets an enhancer may have been trained on.
+
+    Args:
+        enhancer: of the scene.
+
+    Returns:
+        Its `untrained`; itself where it has none.
+    """
+    untrained: Enhancer | None = getattr(enhancer, "untrained", None)
+    return enhancer if untrained is None else untrained
 
 
 @runtime_checkable

@@ -109,6 +109,20 @@ def test_a_restorer_that_destroys_is_left_out(tube: Tube) -> None:
     assert judged(tube, None, without).trials[0] != control
 
 
+class Trained(ClassicalEnhancer):
+    """A restorer that has learned from the frames of the scene, and before that destroyed."""
+
+    untrained = Destroyer("")
+
+    def restore(self, clip: Clip) -> Restoration:
+        raise AssertionError("it knows the frames that are left out")
+
+
+def test_a_restorer_does_not_restore_frames_that_it_was_trained_on(tube: Tube) -> None:
+    config = FINETUNE.model_copy(update={"iterations": 10})
+    assert judged(tube, Trained(""), config) == judged(tube, Destroyer(""), config)
+
+
 def test_it_tells_how_much_of_restored_views_serves(tube: Tube, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a restorer that changes nothing: the trial's coarse scene against its fine-tuned one."""
     asked: list[float] = []

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 from extrags.config import PipelineConfig, profile_config
+from extrags.config.settings import settings_of
 from extrags.errors import ConfigError
 from extrags.run_costs import (
+    WORKLOAD_SETTINGS,
     CostModel,
     TaskCost,
     Workload,
@@ -23,6 +25,7 @@ from extrags.run_costs import (
     stage_tasks,
 )
 from extrags.stages import STAGES, modelled_tasks
+from tests.other_values import other_values
 
 
 def work(
@@ -104,6 +107,39 @@ class TestFit:
     def test_without_records(self) -> None:
         with pytest.raises(ConfigError, match="no record"):
             fitted([], 0.01)
+
+
+class TestWorkloadSettings:
+    def test_they_are_those_that_costs_depend_on(self) -> None:
+        def costs(config: PipelineConfig) -> tuple[object, ...]:
+            # Wide enough to be restored smaller.
+            numbers = Workload(640 * 480, 48, 24, 24, config, width=640).numbers()
+            tasks = [stage_tasks(stage, config) for stage in STAGES]
+            return numbers, tasks, [beyond_the_fit(task, config) for tasks in tasks for task in tasks]
+
+        quick = profile_config("quick")
+        known = settings_of(PipelineConfig)
+        read = set()
+        # Some are read only without densification, or where starts outnumber trajectories.
+        other = quick.with_overrides({"coarse.densify.enabled": False, "explore.trajectories": 3})
+        for base in (quick, other):
+            before = costs(base)
+            for name, setting in known.items():
+                values = other_values(setting, base.value(name))
+                assert values, name
+                read |= {name for value in values if costs(with_value(base, name, value)) != before}
+        assert read == set(WORKLOAD_SETTINGS)
+
+    def test_they_are_named_once(self) -> None:
+        assert len(set(WORKLOAD_SETTINGS)) == len(WORKLOAD_SETTINGS)
+
+
+def with_value(base: PipelineConfig, name: str, value: object) -> PipelineConfig:
+    """With another value of a setting; as it was where that does not go together with the others."""
+    try:
+        return base.with_overrides({name: value})
+    except ConfigError:
+        return base
 
 
 class TestGaussians:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -56,6 +57,8 @@ EARLIER_FORMATS: dict[int, dict[str, Any]] = {
 """What stands for what earlier formats that can be read lack, or have of another kind: the domain, of other
 features."""
 PATCHES = "patches.safetensors"
+UNTRAINED = "untrained"
+"""Folder inside that of a restorer."""
 COLOR_STEPS = 255
 CHANNELS_OF_NETWORKS = (CONDITION_CHANNELS, CONDITION_CHANNELS + INVENTED_CHANNELS)
 """Without and with channels of their own for what keyframes have invented."""
@@ -90,6 +93,8 @@ class EmbeddedEnhancer:
             and before there is a scene.
         scene_calibrated: the calibration is that of the scene's left-out frames.
         depth_from_image: depth in holes is read from the restored image.
+        untrained: what the restorer was before it was trained on the scene; None where it was not, or began
+            with nothing.
     """
 
     network: RestorationNetwork
@@ -108,6 +113,7 @@ class EmbeddedEnhancer:
     depth_from_image: bool = False
     domain_score: float | None = None
     scene_calibrated: bool = False
+    untrained: EmbeddedEnhancer | None = None
 
     name = "embedded"
     follows_keyframes = True
@@ -283,7 +289,7 @@ class EmbeddedEnhancer:
         }
 
     def save(self, path: Path, *, half: bool = False) -> None:
-        """Write `restorer.safetensors` and `restorer.json`.
+        """Write `restorer.safetensors` and `restorer.json`, and a folder for what it was before, if anything.
 
         Args:
             path: a folder.
@@ -301,6 +307,9 @@ class EmbeddedEnhancer:
         (path / PATCHES).unlink(missing_ok=True)
         if self.patches is not None:
             save_file({"patches": (self.patches * COLOR_STEPS).round().to(torch.uint8)}, str(path / PATCHES))
+        shutil.rmtree(path / UNTRAINED, ignore_errors=True)
+        if self.untrained is not None:
+            self.untrained.save(path / UNTRAINED, half=half)
         description = {
             "backend": self.name,
             "format": FORMAT,
@@ -379,6 +388,7 @@ class EmbeddedEnhancer:
                 bool(description["depth_from_image"]),
                 None if description["domain_score"] is None else float(description["domain_score"]),
                 bool(description["scene_calibrated"]),
+                _read_untrained(weights_file.with_name(UNTRAINED)),
             )
         try:
             network.load_state_dict(
@@ -411,6 +421,10 @@ def _read_patches(file: Path) -> Float[Tensor, "r 3 s s"] | None:
         return load_safetensors(file)["patches"].float() / COLOR_STEPS
     except (OSError, RuntimeError, ValueError, KeyError) as error:
         raise WeightsError(f"{file}: not the patches of a scene's frames ({error})") from error
+
+
+def _read_untrained(folder: Path) -> EmbeddedEnhancer | None:
+    return EmbeddedEnhancer.load(folder) if folder.is_dir() else None
 
 
 def pretrained(config: EnhanceConfig) -> EmbeddedEnhancer | None:

@@ -50,7 +50,8 @@ def train_on_scene(
     """Train on a scene's pairs, and keep the training only where the validation pairs show a gain.
 
     With `start`, its network is fine-tuned; without a gain on the validation pairs, its weights are kept
-    unchanged. The same pairs and settings give the same weights, whatever the number of threads.
+    unchanged. With one, what it was before is kept beside it (`EmbeddedEnhancer.untrained`). The same pairs
+    and settings give the same weights, whatever the number of threads.
 
     Args:
         pairs: training and validation pairs of the scene.
@@ -79,13 +80,20 @@ def train_on_scene(
     trained = training.run(config.train_iterations) if start is None else training.probed()
     # Without validation pairs no gain can be measured, and the pretrained network is kept.
     kept = trained.gain_db > MIN_GAIN_DB and (start is None or validation_pairs(pairs) is not None)
-    steps = _best(trained.scores if kept else before, candidates)[0]
-    record = {**base.record, **training.record(trained), "scene_training_kept": kept}
-    enhancer = replace(trained.enhancer if kept else base, steps=steps, record=record)
+    record = {**base.record, **training.record(trained)}
     validating = validation_pairs(pairs)
-    if validating is None:
-        return enhancer
-    return with_calibration(enhancer, restored_pairs(enhancer, validating, transfer))
+
+    def ready(restorer: EmbeddedEnhancer, scores: Scores, *, kept: bool) -> EmbeddedEnhancer:
+        told = {**record, "scene_training_kept": kept}
+        enhancer = replace(restorer, steps=_best(scores, candidates)[0], record=told)
+        if validating is None:
+            return enhancer
+        return with_calibration(enhancer, restored_pairs(enhancer, validating, transfer))
+
+    if not kept:
+        return ready(base, before, kept=False)
+    untrained = None if start is None else ready(base, before, kept=False)
+    return replace(ready(trained.enhancer, trained.scores, kept=True), untrained=untrained)
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from extrags.cameras import pixel_rays
 from extrags.config import PosesConfig
 from extrags.errors import CaptureError
 from extrags.events import Event, Progress, subscribed
@@ -175,11 +176,52 @@ class TestAlign:
         # 200 / 3: sizes are divided by whole numbers.
         assert view.valid.shape == (50, 66)
         assert sequence.depth_mm is not None
-        assert view.points[20, 30, 2] == sequence.depth_mm[0, 61, 91]
+        assert view.points[20, 30, 2] == pytest.approx(sequence.depth_mm[0, 61, 91])
         u = view.K[0, 0] * view.points[20, 30, 0] / view.points[20, 30, 2] + view.K[0, 2]
         assert u == pytest.approx(30.5)
         known = np.abs(view.normals).sum(-1) > 0
         assert (view.normals * view.points).sum(-1)[known].max() < 0
+
+    @pytest.mark.parametrize(("max_width", "step"), [(100, 2), (67, 3), (50, 4)])
+    def test_frames_that_are_upside_down(self, max_width: int, step: int) -> None:
+        """Depth and colours of different places would differ to the other side."""
+        # Sizes that no step divides: blocks of the two frames differ. Of a picture on a plane ahead, the
+        # colours alone tell the place.
+        room = room_sequence(4, width=199, height=149)
+        ahead = np.array([0.0, 0.0, 20.0, 1.0])
+        upright = replace(room, depth_mm=np.full(room.mask.shape, ahead[2], np.float32))
+        turned = replace(upright, rgb=np.ascontiguousarray(room.rgb[:, ::-1, ::-1]))
+        first, second = depth_view(upright, 0, max_width), depth_view(turned, 0, max_width)
+        assert first is not None
+        assert second is not None
+        assert second.valid.shape == (149 // step, 199 // step)
+        half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
+        start = half_turn.copy()
+        start[:3, 3] += [0.2, -0.1, 0.1]
+        pose = align(second, start, [Posed(first, np.eye(4))])
+        off_px = room.K[0, 0, 0] * (np.linalg.inv(pose) @ half_turn @ ahead - ahead)[:2] / ahead[2]
+        assert np.linalg.norm(off_px) < 0.25
+
+    @pytest.mark.parametrize("step", [1, 2, 3, 4])
+    def test_depth_of_a_slanted_wall_and_of_a_fold(self, step: int) -> None:
+        room = room_sequence(4, width=120, height=96)
+        rays = pixel_rays(room.cameras[0])[0] @ np.asarray(room.cameras.world_from_camera[0, :3, :3])
+        # In camera axes: a wall 10 ahead that recedes to the right, and behind its edge another.
+        normal, distance = np.array([-0.3, 0.1, 1.0]), 10.0
+        depth = distance / (rays @ normal)
+        # It lies in the middle of a block.
+        edge = 60 + step // 2
+        depth[:, edge:] += 30
+        shown = replace(room, depth_mm=np.tile(depth.astype(np.float32), (len(room), 1, 1)))
+        view = depth_view(shown, 0, 120 // step)
+        assert view is not None
+        wall = view.valid & (np.arange(view.valid.shape[1]) < edge // step - 1)
+        assert wall.mean() > 0.4
+        np.testing.assert_allclose(view.points[wall] @ normal, distance, rtol=1e-5)
+        # Of the two surfaces, and of nothing between them.
+        points = view.points[view.valid]
+        behind = points[:, 2] - distance / (points / points[:, 2:] @ normal)
+        assert np.minimum(np.abs(behind), np.abs(behind - 30)).max() < 1e-4
 
 
 class TestLandmarks:

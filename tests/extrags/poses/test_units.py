@@ -65,8 +65,15 @@ def found() -> PoseJobResult:
 def posed(given: EndoscopicSequence, working_distance_mm: float | None = None) -> EndoscopicSequence:
     settings = PosesConfig(working_distance_mm=working_distance_mm)
     registered = np.ones(FRAMES, bool)
-    made = _from_colmap(given, found(), registered, {"mean_reprojection_px": 0.0}, settings)
+    # As `estimate_poses` does where held-out frames alone have depth.
+    shown = given if given.training_depth_known else replace(given, depth_mm=None)
+    made = _from_colmap(shown, found(), registered, {"mean_reprojection_px": 0.0}, settings)
     return with_estimated_poses(given, made)
+
+
+def withheld(given: EndoscopicSequence) -> EndoscopicSequence:
+    """True depth is for the evaluation alone."""
+    return given.without_training_depth()
 
 
 @pytest.mark.parametrize(
@@ -150,6 +157,55 @@ def test_a_scale_of_the_poses_that_are_replaced_is_refused(monkeypatch: pytest.M
     ):
         with pytest.raises(CaptureError, match="COLMAP ran"):
             estimate.estimate_poses(given, config)
+
+
+@pytest.mark.parametrize(
+    ("metric", "working_distance_mm", "far", "true_far"),
+    [
+        pytest.param(True, None, FAR / UNIT, FAR / UNIT, id="metric truth, poses of no unit"),
+        pytest.param(False, None, FAR / UNIT, FAR / UNIT, id="neither metric"),
+        pytest.param(False, 50.0, 50.0, 50.0, id="truth of another unit, metric poses"),
+        # How far the distance told is off counts in the figures.
+        pytest.param(True, 50.0, 50.0, FAR, id="both metric"),
+    ],
+)
+def test_withheld_truth_follows_the_poses(
+    metric: bool, working_distance_mm: float | None, far: float, true_far: float
+) -> None:
+    after = posed(withheld(sequence(metric=metric)), working_distance_mm)
+    assert after.metric == (working_distance_mm is not None)
+    assert after.points is not None
+    assert after.true_depth_mm is not None
+    np.testing.assert_allclose(after.points[:, 2], far, rtol=1e-5)
+    np.testing.assert_allclose(after.true_depth_mm, true_far, rtol=1e-5)
+    assert not after.training_depth_known
+
+
+@pytest.mark.parametrize("working_distance_mm", [None, 50.0])
+def test_withheld_truth_of_an_unknown_unit_is_left_out(working_distance_mm: float | None) -> None:
+    given = sequence(metric=False)
+    assert given.depth_mm is not None
+    few = np.zeros_like(given.depth_mm)
+    few[:, 30, 40] = FAR
+    after = posed(withheld(replace(given, depth_mm=few)), working_distance_mm)
+    assert after.true_depth_mm is None
+
+
+def test_withheld_truth_follows_an_alignment_by_estimated_depth(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Depth that was estimated may be aligned by, beside true depth that was withheld."""
+    given = sequence(metric=False)
+    assert given.depth_mm is not None
+    both = replace(given, withheld_depth_mm=2 * given.depth_mm)
+    placed = found()
+    aligned = RgbdAlignment(placed.world_from_camera, placed.points, placed.points_rgb, {"without_depth": []})
+    monkeypatch.setattr(estimate, "align_by_depth", lambda *_: aligned)
+    for working_distance_mm, factor in ((None, 1.0), (50.0, 50 / FAR)):
+        config = PosesConfig(fallback="rgbd", working_distance_mm=working_distance_mm)
+        after = with_estimated_poses(both, estimate.estimate_poses(both, config))
+        assert after.depth_mm is not None
+        assert after.true_depth_mm is not None
+        np.testing.assert_allclose(after.depth_mm, factor * FAR)
+        np.testing.assert_allclose(after.true_depth_mm, factor * 2 * FAR)
 
 
 @pytest.mark.parametrize("working_distance_mm", [None, 50.0])

@@ -30,7 +30,7 @@ from extrags.restoration.diffusion.rectified_flow import Predicted, sample
 from extrags.restoration.diffusion.scene_restorer import better_of_both
 from extrags.restoration.diffusion.scene_training import train_on_scene
 from extrags.restoration.diffusion.validation import restored_pairs, validation_pairs
-from extrags.restoration.protocol import Clip, Enhancer
+from extrags.restoration.protocol import Clip, Enhancer, never_trained_on
 from extrags.restoration.training_data.augmentation import Batch
 from extrags.restoration.training_data.pairs import Pairs
 from extrags.restoration.uncertainty import calibration
@@ -241,14 +241,13 @@ class TestEmbedded:
         harmful = SMALL.model_copy(update={"scene_learning_rate": 0.5, "train_iterations": 3})
         kept = train_on_scene(tube_pairs, tube.references.transfer, harmful, trained)
         assert kept.record["scene_training_kept"] is False
+        assert never_trained_on(kept) is kept
         for one, two in zip(
             kept.network.state_dict().values(), trained.network.state_dict().values(), strict=True
         ):
             assert torch.equal(one, two)
 
-    def test_training_that_helps_is_kept(
-        self, tube: Tube, tube_pairs: Pairs, trained: EmbeddedEnhancer
-    ) -> None:
+    def test_training_that_helps_is_kept(self, tube: Tube, tube_pairs: Pairs, clip: Clip, tmp_path) -> None:
         crude = train_on_scene(
             tube_pairs, tube.references.transfer, SMALL.model_copy(update={"train_iterations": 4})
         )
@@ -257,6 +256,21 @@ class TestEmbedded:
         scores = kept.record["validation"]
         assert kept.record["scene_training_kept"] is True
         assert scores["embedded_1"]["psnr"] > scores["untrained_embedded_1"]["psnr"]
+        # What it was before stays beside it, as it would have been kept.
+        assert kept.untrained is not None
+        assert kept.untrained.record["scene_training_kept"] is False
+        assert kept.untrained.untrained is None
+        kept.save(tmp_path)
+        loaded = load_enhancer(tmp_path)
+        assert isinstance(loaded, EmbeddedEnhancer)
+        assert np.array_equal(loaded.restore(clip).rgb, kept.restore(clip).rgb)
+        before = never_trained_on(loaded).restore(clip)
+        assert np.array_equal(before.rgb, replace(crude, steps=kept.untrained.steps).restore(clip).rgb)
+        assert not np.array_equal(before.rgb, kept.restore(clip).rgb)
+        # Nor is it left over from a restorer that was saved there before.
+        crude.save(tmp_path)
+        loaded = load_enhancer(tmp_path)
+        assert never_trained_on(loaded) is loaded
 
     def test_without_iterations_the_pretrained_restorer_serves(
         self, tube: Tube, trained: EmbeddedEnhancer, clip: Clip, tmp_path
