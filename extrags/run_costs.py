@@ -42,7 +42,7 @@ __all__ = [
     "stage_tasks",
 ]
 
-MEMORY_TERMS = ("one", "pixels", "held_pixels", "restored", "train*restored", "gaussians")
+MEMORY_TERMS = ("one", "pixels", "held_pixels", "restored", "train*restored", "views*restored", "gaussians")
 """Terms of the memory of each task; of some, of the Gaussians of the final scene."""
 EVALUATION_TERMS = ("pixels*stacks", "pixels*vgg")
 """Further terms of the memory of what evaluates."""

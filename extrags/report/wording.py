@@ -74,10 +74,11 @@ def restorer_words(provenance: Mapping[str, Any]) -> str:
 
 
 def _domain_words(score: float) -> str:
-    place = f"{number(score, 2)} times as far from those the network was trained on as the limit"
-    if score > 1:
-        return f"The frames of this scene are {place}: they are not what it knows."
-    return f"The frames of this scene are {place}: they are like what it knows."
+    likeness, side = ("unlike", "above") if score > 1 else ("like", "at most")
+    return (
+        f"Domain score {number(score, 2)}: frames of this scene are {likeness} those that the network was "
+        f"trained on ({side} 1)."
+    )
 
 
 def _judged_words(provenance: Mapping[str, Any]) -> str:
