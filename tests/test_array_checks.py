@@ -5,7 +5,7 @@ import pytest
 from jaxtyping import Float, TypeCheckError
 
 from extrags.cameras import Cameras, rotation_about
-from tests.array_checks import has_arrays
+from tests.array_checks import FIRST_CALLS, ONE_OF_CALLS, has_arrays, sampled
 
 Pixels = dict[str, Float[np.ndarray, "h w"]]
 
@@ -32,3 +32,26 @@ def test_arrays_are_found_by_their_types_and_by_other_names_of_these() -> None:
 def test_a_wrong_shape_is_refused() -> None:
     with pytest.raises(TypeCheckError, match="axis"):
         rotation_about(np.zeros(4), 0.1)
+
+
+def test_the_first_calls_are_checked_and_one_of_so_many_later_ones() -> None:
+    checked: list[int] = []
+    plain: list[int] = []
+
+    def decorator(_: object) -> object:
+        return checked.append
+
+    function = sampled(plain.append, decorator)
+    last = FIRST_CALLS + 3 * ONE_OF_CALLS
+    for number in range(last):
+        function(number)
+    assert checked[:FIRST_CALLS] == list(range(FIRST_CALLS))
+    assert checked[FIRST_CALLS:] == [n for n in range(FIRST_CALLS, last) if n % ONE_OF_CALLS == 0]
+    assert sorted(checked + plain) == list(range(last))
+
+
+def test_what_is_never_called_is_never_decorated() -> None:
+    def decorator(_: object) -> object:
+        raise AssertionError("decorated")
+
+    assert sampled(of_a_result, decorator).__name__ == "of_a_result"
