@@ -14,9 +14,6 @@ from data_catalog.image_pages import pages_in
 from data_catalog.images import (
     UPRIGHT,
     color_files,
-    file_key,
-    natural_key,
-    order_for_fingerprint,
     orientation,
     read_color,
     read_depth,
@@ -223,24 +220,6 @@ class TestMasks:
     def test_black_of_a_jpeg_is_not_all_of_one_value(self, tmp_path: Path) -> None:
         noise = np.random.default_rng(0).integers(0, 6, (20, 30), dtype=np.uint8)
         assert not read_mask(written(tmp_path / "a.jpg", noise)).any()
-
-
-def test_natural_order() -> None:
-    names = ["f10.png", "f9.png", "f09b.png", "f1.png", "a.png"]
-    assert sorted(names, key=natural_key) == ["a.png", "f1.png", "f9.png", "f09b.png", "f10.png"]
-
-
-def test_a_suffix_has_no_place_in_the_order() -> None:
-    """Windows numbers copies so; the first was read last, as a blank comes before a dot."""
-    names = ["frame.png", "frame (0).png", "frame (2).JPG", "frame (10).png", "frame-1.png"]
-    assert sorted(set(names), key=file_key) == names
-    assert sorted(["b.2", "b.10", "b"], key=file_key) == ["b", "b.2", "b.10"]
-    assert sorted(["7.png", "007.png"], key=file_key) == ["007.png", "7.png"]
-
-
-def test_an_order_counts_in_a_cache_key_where_it_was_another() -> None:
-    assert order_for_fingerprint(["f10.png", "f9.png", "f_1.jpg", "f1.png"]) == {}
-    assert order_for_fingerprint(["f (2).png", "f.png"]) == {"order": "without suffixes"}
 
 
 def test_spread_keeps_both_ends() -> None:
