@@ -38,6 +38,9 @@ __all__ = [
 
 BITS_PER_SAMPLE = 258
 """Tag of TIFF."""
+_SAMPLES_PER_PIXEL = 277
+_SAMPLE_FORMAT = 339
+_SAMPLE_FORMATS = {1: "integers", 2: "signed integers", 3: "floating-point numbers"}
 _ORIENTATION = 274
 """Tag of EXIF."""
 UPRIGHT = 1
@@ -313,6 +316,36 @@ def depth_suffixes_in_words() -> str:
     return f"{', '.join(DEPTH_SUFFIXES[:-1])} or {DEPTH_SUFFIXES[-1]} with one number per pixel"
 
 
+def _tiff_values(file: Path, field: str) -> str | None:
+    """What of the values in a TIFF is not read, in words; None where they are of a kind that is.
+
+    Args:
+        file: that Pillow cannot identify.
+        field: what it should hold.
+    """
+    from PIL.TiffImagePlugin import ImageFileDirectory_v2
+
+    try:
+        with file.open("rb") as stream, warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            directory = ImageFileDirectory_v2(stream.read(8))
+            stream.seek(directory.next)
+            directory.load(stream)
+        bits = int(np.max(directory.get(BITS_PER_SAMPLE, 1)))
+        stored = int(np.max(directory.get(_SAMPLE_FORMAT, 1)))
+        channels = int(directory.get(_SAMPLES_PER_PIXEL, 1))
+    except Exception:
+        # Of a damaged directory nothing is told but that it is damaged; Pillow reports that as anything.
+        return None
+    values = f"{_SAMPLE_FORMATS.get(stored, 'values')} of {bits} bits"
+    if field == "depth":
+        return f"{channels} channels of {values}; expected one number per pixel" if channels > 1 else None
+    if stored == 1 and bits <= 16:
+        return None
+    what = "colours" if channels > 1 else "grey"
+    return f"{what} in {values}, which are not read; expected integers of 8 or 16 bits without a sign"
+
+
 @contextmanager
 def _image_errors(file: Path, frame: object, field: str) -> Iterator[None]:
     """What Pillow raises for a file, as the errors of a source."""
@@ -327,8 +360,11 @@ def _image_errors(file: Path, frame: object, field: str) -> Iterator[None]:
             is_tiff = stream.read(4) in _TIFF_SIGNATURES
         # Those of 64-bit numbers, which numpy's are unless somebody asks for others.
         kind = "a TIFF of a kind that is not read, expected are numbers of at most 32 bits"
+        told = _tiff_values(file, field) if is_tiff else None
         if field == "depth" and file.suffix.lower() not in DEPTH_SUFFIXES:
             problem = f"depth of this format is not read; expected {depth_suffixes_in_words()}"
+        elif told is not None:
+            problem = told
         else:
             damage = f"or damaged from its first bytes ({file.stat().st_size} bytes)"
             problem = f"{kind if is_tiff else 'not an image'}, {damage}"

@@ -93,6 +93,37 @@ def test_floating_point_has_no_white(tmp_path: Path) -> None:
         read_color(file, frame=7)
 
 
+@pytest.mark.parametrize(
+    ("pixels", "told"),
+    [
+        (np.zeros((8, 9, 3), np.float32), "colours in floating-point numbers of 32 bits, which are not read"),
+        (np.zeros((8, 9), np.float64), "grey in floating-point numbers of 64 bits, which are not read"),
+        (np.zeros((8, 9, 3), np.int16), "colours in signed integers of 16 bits, which are not read"),
+        (np.zeros((8, 9, 3), np.uint32), "colours in integers of 32 bits, which are not read"),
+    ],
+)
+def test_colours_that_are_not_read_are_said_to_be_of_their_kind(tmp_path: Path, pixels, told: str) -> None:
+    """Floating-point colours of 32 bits were refused as numbers of more than 32."""
+    file = written(tmp_path / "a.tif", pixels)
+    with pytest.raises(
+        SourceError, match=f"field rgb: {told}; expected integers of 8 or 16 bits without a s"
+    ):
+        read_color(file)
+    if pixels.ndim == 3:
+        with pytest.raises(
+            SourceError, match=r"field depth: 3 channels of .*; expected one number per pixel"
+        ):
+            read_depth(file)
+
+
+@pytest.mark.filterwarnings("ignore:Corrupt EXIF data")
+def test_a_tiff_whose_description_is_damaged_is_said_to_be_damaged(tmp_path: Path) -> None:
+    file = written(tmp_path / "a.tif", np.zeros((8, 9, 3), np.float32))
+    file.write_bytes(file.read_bytes()[:60])
+    with pytest.raises(SourceError, match=r"field rgb: .*damaged.* \(60 bytes\)"):
+        read_color(file)
+
+
 def test_a_tiff_that_is_not_read_is_not_said_to_be_no_image(tmp_path: Path) -> None:
     file = written(tmp_path / "a.tif", GREY.astype(np.float64))
     with pytest.raises(SourceError, match=r"field depth: a TIFF of a kind .* at most 32 bits, or damaged"):
