@@ -84,6 +84,8 @@ FEWEST_FRAMES = 4
 """Fewer stills beside a video are pictures about it: poses could not be estimated from them."""
 _CLEARLY_MORE = 2
 _LOOKED_AT_FOR_COMBS = 12
+_PINHOLE = ("fx", "fy", "cx", "cy")
+_EXPECTED = "expected K, or fx, fy, cx, cy, or field_of_view_deg"
 _SIZES = (("width", "height"), ("w", "h"))
 
 
@@ -365,7 +367,7 @@ def read_intrinsics(
         if "K" in content:
             K = np.asarray(content["K"], dtype=np.float64)
         elif "field_of_view_deg" in content:
-            angle = float(content["field_of_view_deg"])
+            angle = _number(content, "field_of_view_deg", file)
             if not 1 < angle < 179:
                 raise SourceError(
                     f"{angle:g} degrees; expected 1 to 179 for a pinhole",
@@ -374,18 +376,37 @@ def read_intrinsics(
                 )
             K = intrinsics_of_field_of_view(angle, width, height, pixel_aspect=pixel_aspect)
         else:
-            fx, fy, cx, cy = (float(content[key]) for key in ("fx", "fy", "cx", "cy"))
+            _check_complete(content, file)
+            fx, fy, cx, cy = (_number(content, key, file) for key in _PINHOLE)
             K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
     except SourceError:
         raise
-    except (KeyError, OverflowError, RecursionError, TypeError, ValueError) as error:
-        raise SourceError(
-            f"expected K, or fx, fy, cx, cy, or field_of_view_deg: {error!r}", file=file, field="K"
-        ) from error
+    except (OverflowError, RecursionError, TypeError, ValueError) as error:
+        raise SourceError(f"{_EXPECTED}: {error}", file=file, field="K") from error
     if K.shape != (3, 3):
         raise SourceError(f"found shape {K.shape}; expected 3 x 3 numbers", file=file, field="K")
     check_intrinsics(K, width, height, file=file)
     return K
+
+
+def _check_complete(content: dict[str, Any], file: Path) -> None:
+    """Refuse a pinhole of which something is not stated.
+
+    Raises:
+        SourceError: names what is missing.
+    """
+    absent = [key for key in _PINHOLE if key not in content]
+    if absent:
+        listed = ", ".join(absent)
+        missing = f"no K, no field_of_view_deg and no {listed}" if absent == [*_PINHOLE] else f"no {listed}"
+        raise SourceError(f"{missing}; {_EXPECTED}", file=file, field="K")
+
+
+def _number(content: dict[str, Any], key: str, file: Path) -> float:
+    try:
+        return float(content[key])
+    except (OverflowError, TypeError, ValueError) as error:
+        raise SourceError(f"{json.dumps(content[key])}; expected a number", file=file, field=key) from error
 
 
 def _check_described(content: dict[str, Any], width: int, height: int, file: Path) -> None:
