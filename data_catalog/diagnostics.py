@@ -9,13 +9,15 @@ from __future__ import annotations
 import hashlib
 import itertools
 from collections.abc import Callable, Iterator
+from decimal import Decimal
+from fractions import Fraction
 
 import numpy as np
 from jaxtyping import Float
 
 from data_catalog.checks import USUAL_MISTAKES, depth_disagreement, other_readings
 from data_catalog.findings import Finding, warning
-from data_catalog.images import natural_key
+from data_catalog.frame_names import NameOrder, is_gap, usual_step
 from data_catalog.mask_findings import mask_findings
 from data_catalog.matches import match_neighbours, pose_support
 from data_catalog.plausible_intrinsics import unlikely
@@ -26,6 +28,7 @@ from extrags.sequence import EndoscopicSequence, saturated_mask
 __all__ = ["Finding", "diagnose"]
 
 _MIN_MATCHES = 60
+_FEWEST_NUMBERED = 7
 # Exact poses of the catalogue's sequences explain 87 to 95 % of the matches; shuffled ones up to 30 % as
 # given, and up to 80 % in the best of 48 readings.
 _CONVINCING_SUPPORT = 0.82
@@ -59,9 +62,14 @@ def diagnose(sequence: EndoscopicSequence, file: str, *, thinned: bool = False) 
 
 
 def _late(names: list[str]) -> int | None:
-    """The first frame whose name comes before that of the one in front of it."""
-    keys = [natural_key(name) for name in names]
-    return next((k for k in range(1, len(keys)) if keys[k] < keys[k - 1]), None)
+    """The first frame whose name comes before that of the one in front of it, however its number is read."""
+    order = NameOrder(names)
+    found = []
+    for key in (order.key, order.other_key):
+        # Keys alone: of names that are alike but for a zero, either may be first.
+        keys = [key(name)[0] for name in names]
+        found.append(next((k for k in range(1, len(keys)) if keys[k] < keys[k - 1]), None))
+    return None if None in found else found[0]
 
 
 def _order(sequence: EndoscopicSequence) -> Iterator[Finding]:
@@ -83,12 +91,14 @@ def _missing(sequence: EndoscopicSequence) -> Iterator[Finding]:
     """Single frames that are missing from a regular numbering."""
     for members in _recordings(sequence):
         names = [sequence.frame_name(k) for k in members]
-        numbers = [_number(name) for name in names]
-        steps = [after - before for before, after in itertools.pairwise(numbers)]
-        if len(steps) < 6 or min(numbers) < 0 or _late(names) is not None:
+        order = NameOrder(names)
+        numbers = [order.number(name) for name in names]
+        if len(names) < _FEWEST_NUMBERED or None in numbers or _late(names) is not None:
             continue
-        usual = sorted(steps)[len(steps) // 2]
-        gaps = [k for k, step in enumerate(steps) if step != usual]
+        steps, digits = _steps([number for number in numbers if number is not None])
+        usual = usual_step(steps)
+        # Decimals are rounded, and times of a recorder uneven; frames are counted exactly.
+        gaps = [k for k, step in enumerate(steps) if (is_gap(step, usual) if digits else step != usual)]
         anew = next((k for k, step in enumerate(steps) if step < 0), None)
         if anew is not None:
             yield warning(
@@ -104,8 +114,8 @@ def _missing(sequence: EndoscopicSequence) -> Iterator[Finding]:
             gap = gaps[0]
             yield warning(
                 "missing frame",
-                f"the next frame is {names[gap + 1]}, {steps[gap]} on; all others are {usual} apart. "
-                "Frames are missing between the two",
+                f"the next frame is {names[gap + 1]}, {_in_words(steps[gap], digits)} on; all others are "
+                f"{_in_words(usual, digits)} apart. Frames are missing between the two",
                 frame=names[gap],
                 field="frame names",
             )
@@ -445,11 +455,16 @@ def _neighbours(sequence: EndoscopicSequence) -> Iterator[tuple[int, int]]:
         yield from itertools.pairwise(members)
 
 
-def _number(name: str) -> int:
-    """The last number of a name; -1 without any."""
-    numbers = [text for kind, _, text in natural_key(name) if kind == 1]
-    # Of zeros, no digit is left.
-    return int(numbers[-1] or 0) if numbers else -1
+def _steps(numbers: list[Decimal]) -> tuple[list[int], int]:
+    """Steps between numbers in units of their last digit, and how many digits stand behind the point."""
+    digits = max(-int(number.as_tuple().exponent) for number in numbers)
+    # Fractions are exact, where a product of decimals has no more than 28 digits.
+    units = [int(Fraction(number) * 10**digits) for number in numbers]
+    return [after - before for before, after in itertools.pairwise(units)], digits
+
+
+def _in_words(step: int, digits: int) -> str:
+    return f"{step / 10**digits:.12g}" if digits else str(step)
 
 
 def _brightness(sequence: EndoscopicSequence) -> Float[np.ndarray, "f"]:

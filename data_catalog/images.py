@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import re
 import struct
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from data_catalog.frame_names import COLOR_SUFFIXES, NameOrder
 from data_catalog.inside import inside
 from extrags.array_files import load_npy
 from extrags.errors import SourceError, SourceNotFoundError
@@ -27,11 +26,8 @@ __all__ = [
     "check_links",
     "color_files",
     "depth_suffixes_in_words",
-    "file_key",
     "image_entries",
     "image_size",
-    "natural_key",
-    "order_for_fingerprint",
     "orientation",
     "read_color",
     "read_depth",
@@ -42,49 +38,19 @@ __all__ = [
 
 BITS_PER_SAMPLE = 258
 """Tag of TIFF."""
+_SAMPLES_PER_PIXEL = 277
+_SAMPLE_FORMAT = 339
+_SAMPLE_FORMATS = {1: "integers", 2: "signed integers", 3: "floating-point numbers"}
 _ORIENTATION = 274
 """Tag of EXIF."""
 UPRIGHT = 1
 """Orientation of images whose pixels lie as they are shown."""
 _TIFF_SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-COLOR_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 DEPTH_SUFFIXES = (".npy", ".tiff", ".tif", ".png")
 _MASK_THRESHOLD = 127
 _LOSSY_SUFFIXES = (".jpg", ".jpeg")
 _LOSSLESS_WEBP = b"VP8L"
 """Of the part that holds the pixels; of lossy ones it has a blank."""
-
-
-def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
-    """Sort key that reads runs of digits as numbers: `9_color.png` comes before `10_color.png`."""
-    parts = re.split(r"(\d+)", name)
-    # Digits are compared as text of their length: numbers of any length, and of any script, have a place.
-    digits = [part.lstrip("0") if part.isdecimal() else None for part in parts]
-    return tuple(
-        (0, 0, part) if number is None else (1, len(number), number)
-        for part, number in zip(parts, digits, strict=True)
-        if part
-    )
-
-
-def file_key(name: str) -> tuple[tuple[tuple[int, int, str], ...], str]:
-    """Sort key of an image's name or path: by `natural_key` without suffix, `a.png` before `a (2).png`."""
-    stem, _, suffix = name.rpartition(".")
-    return natural_key(stem if f".{suffix.lower()}" in COLOR_SUFFIXES else name), name
-
-
-def order_for_fingerprint(names: Iterable[str]) -> dict[str, Any]:
-    """What a cache key must tell of the order of images, which is in none of their files.
-
-    Args:
-        names: of the images, or their paths.
-
-    Returns:
-        Nothing where suffixes make no difference to the order: earlier versions took them into account, and
-        their artefacts stay.
-    """
-    listed = sorted(sorted(names), key=natural_key)
-    return {} if listed == sorted(listed, key=file_key) else {"order": "without suffixes"}
 
 
 def color_files(folder: Path) -> list[Path]:
@@ -110,7 +76,8 @@ def image_entries(folder: Path) -> list[Path]:
         and not file.name.startswith(".")
         and (file.is_file() or _leads_nowhere(file))
     ]
-    return sorted(named, key=lambda file: file_key(file.name))
+    order = NameOrder(file.name for file in named)
+    return sorted(named, key=lambda file: order.key(file.name))
 
 
 def check_links(files: Iterable[Path]) -> None:
@@ -349,6 +316,36 @@ def depth_suffixes_in_words() -> str:
     return f"{', '.join(DEPTH_SUFFIXES[:-1])} or {DEPTH_SUFFIXES[-1]} with one number per pixel"
 
 
+def _tiff_values(file: Path, field: str) -> str | None:
+    """What of the values in a TIFF is not read, in words; None where they are of a kind that is.
+
+    Args:
+        file: that Pillow cannot identify.
+        field: what it should hold.
+    """
+    from PIL.TiffImagePlugin import ImageFileDirectory_v2
+
+    try:
+        with file.open("rb") as stream, warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            directory = ImageFileDirectory_v2(stream.read(8))
+            stream.seek(directory.next)
+            directory.load(stream)
+        bits = int(np.max(directory.get(BITS_PER_SAMPLE, 1)))
+        stored = int(np.max(directory.get(_SAMPLE_FORMAT, 1)))
+        channels = int(directory.get(_SAMPLES_PER_PIXEL, 1))
+    except Exception:
+        # Of a damaged directory nothing is told but that it is damaged; Pillow reports that as anything.
+        return None
+    values = f"{_SAMPLE_FORMATS.get(stored, 'values')} of {bits} bits"
+    if field == "depth":
+        return f"{channels} channels of {values}; expected one number per pixel" if channels > 1 else None
+    if stored == 1 and bits <= 16:
+        return None
+    what = "colours" if channels > 1 else "grey"
+    return f"{what} in {values}, which are not read; expected integers of 8 or 16 bits without a sign"
+
+
 @contextmanager
 def _image_errors(file: Path, frame: object, field: str) -> Iterator[None]:
     """What Pillow raises for a file, as the errors of a source."""
@@ -363,8 +360,11 @@ def _image_errors(file: Path, frame: object, field: str) -> Iterator[None]:
             is_tiff = stream.read(4) in _TIFF_SIGNATURES
         # Those of 64-bit numbers, which numpy's are unless somebody asks for others.
         kind = "a TIFF of a kind that is not read, expected are numbers of at most 32 bits"
+        told = _tiff_values(file, field) if is_tiff else None
         if field == "depth" and file.suffix.lower() not in DEPTH_SUFFIXES:
             problem = f"depth of this format is not read; expected {depth_suffixes_in_words()}"
+        elif told is not None:
+            problem = told
         else:
             damage = f"or damaged from its first bytes ({file.stat().st_size} bytes)"
             problem = f"{kind if is_tiff else 'not an image'}, {damage}"

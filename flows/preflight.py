@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Collection
+from functools import cache
 from pathlib import Path
 
 from extrags.config import PipelineConfig
@@ -13,9 +15,14 @@ from extrags.stages import stages_until
 
 __all__ = ["preflight"]
 
+log = logging.getLogger(__name__)
+
 
 def preflight(config: PipelineConfig, until: str, leave_out: Collection[str] = ()) -> None:
     """Check that the models, weights and packages that the settings need are available.
+
+    LPIPS may be absent. Where `EXTRAGS_LPIPS_WEIGHTS` names a place that is not there, a warning says so: its
+    columns would stay empty at the end of a run, or be those that a run with weights has left in the store.
 
     Args:
         config: settings of all stages.
@@ -23,7 +30,7 @@ def preflight(config: PipelineConfig, until: str, leave_out: Collection[str] = (
         leave_out: stages that are left out whatever the plan says.
 
     Raises:
-        WeightsError: when weights are not there; says how to get them.
+        WeightsError: when weights are not there, or damaged; says how to get them.
         MissingDependencyError: when a package is not there; says how to install it.
         SourceNotFoundError: when there is no such file as `imported.scene`.
         SourceError: when it is of a format that is not read.
@@ -67,12 +74,26 @@ def preflight(config: PipelineConfig, until: str, leave_out: Collection[str] = (
     if "enhance" not in wanted:
         return
     # Here, because they load torch, which looking up a deployment must not.
+    from extrags.metrics.lpips_weights import WEIGHTS_VARIABLE, check_weights
     from tasks.weights import lpips_weights
 
-    first, *_ = lpips_weights(config.evaluate)
+    named = os.environ.get(WEIGHTS_VARIABLE)
+    found = lpips_weights(config.evaluate)
+    for weights in found:
+        if weights.paths:
+            check_weights(tuple(map(Path, weights.paths)), weights.net)
+        elif named and not Path(named).expanduser().is_file():
+            _say_once(f"{weights.reason}; figures of LPIPS with {weights.net} stay empty")
+    first, *_ = found
     if "enhance" not in leave_out:
         if config.enhance.pixel_confidence == "raw" and first.digest is None:
             raise WeightsError(f"enhance.pixel_confidence=raw is LPIPS itself: {first.reason}")
         from extrags.restoration import check_restorer
 
         check_restorer(config.enhance)
+
+
+@cache
+def _say_once(sentence: str) -> None:
+    """A command looks before its first sequence, and each sequence again."""
+    log.warning("%s", sentence)

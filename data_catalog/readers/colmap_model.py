@@ -34,7 +34,14 @@ from jaxtyping import Float, UInt8
 
 from data_catalog.calibration_files import LENS_OF_POSES
 from data_catalog.folder_reader import FolderReader
-from data_catalog.images import COLOR_SUFFIXES, file_key, natural_key, order_for_fingerprint, save_images
+from data_catalog.frame_names import (
+    COLOR_SUFFIXES,
+    NameOrder,
+    natural_key,
+    order_for_fingerprint,
+    tell_about_order,
+)
+from data_catalog.images import save_images
 from data_catalog.inside import inside
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from data_catalog.readers.beside_frames import tell_about_folders
@@ -192,7 +199,9 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
         raise SourceNotFoundError("no COLMAP model in this folder", file=folder)
     folder = _workspace(folder, place)
     model, pose_file = read_model(place), _pose_file(place)
-    listed = sorted(model.images, key=lambda image: file_key(image.name))
+    order = NameOrder(image.name for image in model.images)
+    listed = sorted(model.images, key=lambda image: order.key(image.name))
+    tell_about_order(folder, order)
     root, located = _located(folder, [image.name for image in listed], pose_file)
     _tell_about_unposed(root, {item.name for item in located.values()})
     files = {name: item.color for name, item in located.items()}

@@ -38,7 +38,8 @@ from jaxtyping import Bool, Float, UInt8
 
 from data_catalog.calibration_files import LENS_OF_POSES
 from data_catalog.folder_reader import FolderReader
-from data_catalog.images import color_files, order_for_fingerprint, read_color, read_mask, spread
+from data_catalog.frame_names import NameOrder, order_for_fingerprint, tell_about_order
+from data_catalog.images import color_files, read_color, read_mask, spread
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from extrags.array_files import load_npy
 from extrags.config import IngestConfig
@@ -118,6 +119,7 @@ def _chosen(folder: Path) -> dict[str, Any]:
 def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     file = folder / POSES_FILE
     images = _part(folder, _IMAGE_FOLDERS)
+    tell_about_order(images[0].parent, NameOrder(image.name for image in images))
     poses, sizes, _ = read_llff(file)
     if len(poses) != len(images):
         raise PoseError(

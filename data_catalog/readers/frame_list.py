@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from data_catalog.images import natural_key
+from data_catalog.frame_names import natural_key
 from extrags.errors import SourceError, SourceNotFoundError
 
 __all__ = [

@@ -1,11 +1,12 @@
 """Reader of plain frames: a folder of images and nothing else; the poses stage finds the rest.
 
-Images lie in the folder itself, or in `images/` or `rgb/` below it, and are taken in natural order (9 before
-10). Where several of these hold images, those of the one with at least twice as many as any other are taken,
-and the others named in a warning; without such a one the source is refused. Woven (interlaced) images are
-read as they are, with a warning. Of a stereo endoscope the frames of one camera are read
-(`data_catalog.readers.stereo_frames`). What is depth or a mask of a frame by its name is left out, and what
-tells of poses is not read, both with a warning (`data_catalog.readers.beside_frames`).
+Images lie in the folder itself, or in `images/` or `rgb/` below it, and are taken in the order of the
+numbers in their names: 9 before 10, decimals by their values (`data_catalog.frame_names`). Where several of
+these hold images, those of the one with at least twice as many as any other are taken, and the others named
+in a warning; without such a one the source is refused. Woven (interlaced) images are read as they are, with
+a warning. Of a stereo endoscope the frames of one camera are read (`data_catalog.readers.stereo_frames`).
+What is depth or a mask of a frame by its name is left out, and what tells of poses is not read, both with a
+warning (`data_catalog.readers.beside_frames`).
 
 Optional beside them: `intrinsics.json` with `K` (3 x 3), or `fx`, `fy`, `cx`, `cy`, or `field_of_view_deg`
 (horizontal), in pixels of the files with centres at +0.5, of a pinhole; and `mask.png` (white is tissue).
@@ -30,12 +31,12 @@ from data_catalog.checks import check_intrinsics
 from data_catalog.content import content_mask, looked_at
 from data_catalog.folder_reader import FolderReader
 from data_catalog.footage import DICOM_SUFFIXES, VIDEO_SUFFIXES, files_of_kind
+from data_catalog.frame_names import NameOrder, order_for_fingerprint, tell_about_order
 from data_catalog.guessed_intrinsics import ASSUMED_FIELD_OF_VIEW_DEG, intrinsics_of_field_of_view
 from data_catalog.images import (
     check_links,
     image_entries,
     image_size,
-    order_for_fingerprint,
     read_color,
     spread,
 )
@@ -83,6 +84,8 @@ FEWEST_FRAMES = 4
 """Fewer stills beside a video are pictures about it: poses could not be estimated from them."""
 _CLEARLY_MORE = 2
 _LOOKED_AT_FOR_COMBS = 12
+_PINHOLE = ("fx", "fy", "cx", "cy")
+_EXPECTED = "expected K, or fx, fy, cx, cy, or field_of_view_deg"
 _SIZES = (("width", "height"), ("w", "h"))
 
 
@@ -223,6 +226,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     _tell_what_is_passed_over(folder, read)
     read.check_and_tell()
     files = read.files
+    tell_about_order(files[0].parent, NameOrder(file.name for file in files))
     views = None if read.pairs else views_in_pictures(files, config.stereo_camera)
     width, height = image_size(files[0], frame=files[0].name)
     pixel_aspect = 1.0
@@ -297,7 +301,14 @@ class _ContentMask:
 
 def _order(folder: Path) -> dict[str, Any]:
     read = _images(folder)
-    return {} if read is None else order_for_fingerprint(file.name for file in read.all_files)
+    if read is None:
+        return {}
+    # Of two cameras each has a folder of its own, or both have one.
+    of_folders: dict[Path, list[str]] = {}
+    for file in read.all_files:
+        of_folders.setdefault(file.parent, []).append(file.name)
+    orders = [order_for_fingerprint(names) for names in of_folders.values()]
+    return next((order for order in orders if order), {})
 
 
 READER = FolderReader(
@@ -356,7 +367,7 @@ def read_intrinsics(
         if "K" in content:
             K = np.asarray(content["K"], dtype=np.float64)
         elif "field_of_view_deg" in content:
-            angle = float(content["field_of_view_deg"])
+            angle = _number(content, "field_of_view_deg", file)
             if not 1 < angle < 179:
                 raise SourceError(
                     f"{angle:g} degrees; expected 1 to 179 for a pinhole",
@@ -365,18 +376,37 @@ def read_intrinsics(
                 )
             K = intrinsics_of_field_of_view(angle, width, height, pixel_aspect=pixel_aspect)
         else:
-            fx, fy, cx, cy = (float(content[key]) for key in ("fx", "fy", "cx", "cy"))
+            _check_complete(content, file)
+            fx, fy, cx, cy = (_number(content, key, file) for key in _PINHOLE)
             K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
     except SourceError:
         raise
-    except (KeyError, OverflowError, RecursionError, TypeError, ValueError) as error:
-        raise SourceError(
-            f"expected K, or fx, fy, cx, cy, or field_of_view_deg: {error!r}", file=file, field="K"
-        ) from error
+    except (OverflowError, RecursionError, TypeError, ValueError) as error:
+        raise SourceError(f"{_EXPECTED}: {error}", file=file, field="K") from error
     if K.shape != (3, 3):
         raise SourceError(f"found shape {K.shape}; expected 3 x 3 numbers", file=file, field="K")
     check_intrinsics(K, width, height, file=file)
     return K
+
+
+def _check_complete(content: dict[str, Any], file: Path) -> None:
+    """Refuse a pinhole of which something is not stated.
+
+    Raises:
+        SourceError: names what is missing.
+    """
+    absent = [key for key in _PINHOLE if key not in content]
+    if absent:
+        listed = ", ".join(absent)
+        missing = f"no K, no field_of_view_deg and no {listed}" if absent == [*_PINHOLE] else f"no {listed}"
+        raise SourceError(f"{missing}; {_EXPECTED}", file=file, field="K")
+
+
+def _number(content: dict[str, Any], key: str, file: Path) -> float:
+    try:
+        return float(content[key])
+    except (OverflowError, TypeError, ValueError) as error:
+        raise SourceError(f"{json.dumps(content[key])}; expected a number", file=file, field=key) from error
 
 
 def _check_described(content: dict[str, Any], width: int, height: int, file: Path) -> None:

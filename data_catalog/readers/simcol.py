@@ -24,7 +24,8 @@ from jaxtyping import Float
 
 from data_catalog.dataset import Descriptor
 from data_catalog.folder_reader import FolderReader
-from data_catalog.images import image_size, natural_key, read_depth
+from data_catalog.frame_names import natural_key
+from data_catalog.images import image_size, read_depth
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from data_catalog.rotations import quaternion_rotation
 from data_catalog.sampling import LensSampling

@@ -9,13 +9,14 @@ is one view.
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from data_catalog.images import image_entries, image_size, natural_key, read_color, spread
+from data_catalog.images import image_entries, image_size, read_color, spread
 from data_catalog.readers.beside_frames import is_of_another_kind, listed_files
 from data_catalog.stereo import (
     AGREES,
@@ -181,7 +182,9 @@ def _by_number(place: StereoFolders, files: list[Path]) -> list[tuple[Path, Path
 
 
 def _numbers(file: Path) -> tuple[str, ...]:
-    return tuple(text for kind, _, text in natural_key(file.stem) if kind == 1)
+    # Zeros in front say nothing, unless they stand behind a point: 0.05 and 0.5 are two moments.
+    found = re.findall(r"((?<=\d)\.)?(\d+)", file.stem)
+    return tuple(digits if point else digits.lstrip("0") for point, digits in found)
 
 
 def _pictures(pairs: list[tuple[Path, Path]]) -> Iterator[tuple[np.ndarray, np.ndarray]]:

@@ -33,12 +33,10 @@ from jaxtyping import Float, UInt8
 
 from data_catalog.calibration_files import LENS_OF_POSES
 from data_catalog.folder_reader import FolderReader
+from data_catalog.frame_names import NameOrder, natural_key, order_for_fingerprint, tell_about_order
 from data_catalog.images import (
     COLOR_SUFFIXES,
-    file_key,
     image_entries,
-    natural_key,
-    order_for_fingerprint,
     read_depth,
     save_images,
 )
@@ -126,7 +124,9 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
         content, known=_KEYS, known_of_frames=_KEYS, frame_name="file_path", file=file, others=_OTHER_KEYS
     )
     scale = _MM_PER_UNIT[unit]
-    listed = sorted(content["frames"], key=lambda entry: file_key(entry["file_path"]))
+    order = NameOrder(entry["file_path"] for entry in content["frames"])
+    listed = sorted(content["frames"], key=lambda entry: order.key(entry["file_path"]))
+    tell_about_order(file, order)
     files = {}
     for entry in listed:
         name = entry["file_path"]

@@ -336,7 +336,7 @@ class _Search:
             elif queue:
                 following = heapq.heappop(queue)[2]
             else:
-                reason = f"no further move is possible after {best.length} views"
+                reason = f"no further move is possible after {_virtual_views(best.length)}"
                 break
             current = following
             emit(Progress("explore-branch", current.length, config.length, {"value": current.path_value}))
@@ -344,9 +344,9 @@ class _Search:
                 best = current
             if current.length >= config.length:
                 best = current
-                reason = f"reached {config.length} views"
+                reason = f"reached {_virtual_views(config.length)}"
             elif expansions >= config.max_expansions:
-                reason = f"budget of {config.max_expansions} expansions spent, {best.length} views"
+                reason = f"budget of {config.max_expansions} expansions spent, {_virtual_views(best.length)}"
         return self._branch_of(best, anchor, expansions, reason)
 
     def _branch_of(self, last: _State, anchor: int, expansions: int, reason: str) -> Branch:
@@ -482,3 +482,8 @@ class _Search:
         before = 0.0 if state.parent is None else state.parent.observation.saturated_share
         limit = max(self.context.config.max_saturated_share, before)
         return state.observation.rejected or state.observation.saturated_share > limit
+
+
+def _virtual_views(length: int) -> str:
+    """Views of a path in words: its first one is the real view that it starts from."""
+    return f"{length - 1} virtual view{'' if length == 2 else 's'}"

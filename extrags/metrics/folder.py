@@ -123,8 +123,8 @@ def _by_number(
     bare = [file.name for file, found in zip(files, numbers, strict=True) if not found]
     if bare:
         raise SourceError(
-            f"a {kind} without a number in its name has no place: {_some(bare)}; name it after its frame "
-            f"({_some(wanted)})",
+            f"{kind}s without a number in their names have no place: {_some(bare)}; name them after their "
+            f"frames ({_some(wanted)})",
             file=folder,
         )
     keys = [tuple(int(number) for number in found) for found in numbers]

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from extrags.config import LpipsNet
 
-__all__ = ["LAYERS", "array_names"]
+__all__ = ["LAYERS", "array_names", "misshapen_array"]
 
 _Step = tuple[str, int]
 # Layers by torchvision's numbers; "tap" hands the current activation out.
@@ -86,3 +88,39 @@ def array_names(net: LpipsNet) -> list[str]:
                 for what in ("weight", "bias")
             ]
     return names
+
+
+def misshapen_array(net: LpipsNet, shapes: Mapping[str, tuple[int, ...]]) -> str | None:
+    """The first array that does not fit those before it; None where all do.
+
+    Args:
+        net: backbone.
+        shapes: of all arrays of `array_names`. A convolution takes the channels that the one before it gives,
+            has a bias for each of its own, and its head a weight.
+    """
+    channels = 3
+    for kind, number in LAYERS[net]:
+        if kind == "tap":
+            if shapes[f"lin{number}"] != (channels,):
+                return f"lin{number}"
+        elif kind.startswith("conv"):
+            wrong = _misshapen_convolution(f"features.{number}", channels, shapes)
+            if wrong is not None:
+                return wrong
+            channels = shapes[f"features.{number}.weight"][0]
+        elif kind == "fire":
+            parts = {part: f"features.{number}.{part}" for part in ("squeeze", "expand1x1", "expand3x3")}
+            for part, name in parts.items():
+                given = channels if part == "squeeze" else shapes[f"{parts['squeeze']}.weight"][0]
+                wrong = _misshapen_convolution(name, given, shapes)
+                if wrong is not None:
+                    return wrong
+            channels = sum(shapes[f"{parts[part]}.weight"][0] for part in ("expand1x1", "expand3x3"))
+    return None
+
+
+def _misshapen_convolution(name: str, channels: int, shapes: Mapping[str, tuple[int, ...]]) -> str | None:
+    weight = shapes[f"{name}.weight"]
+    if len(weight) != 4 or weight[1] != channels:
+        return f"{name}.weight"
+    return None if shapes[f"{name}.bias"] == weight[:1] else f"{name}.bias"

@@ -22,12 +22,13 @@ from extrags.array_files import load_npz, load_state_dict
 from extrags.config import LpipsNet
 from extrags.data_directories import weights_roots
 from extrags.errors import ConfigError, WeightsError, installed_with
-from extrags.metrics.lpips_networks import LAYERS, array_names
+from extrags.metrics.lpips_networks import LAYERS, array_names, misshapen_array
 
 __all__ = [
     "BACKBONES",
     "BACKBONES_URL",
     "WEIGHTS_VARIABLE",
+    "check_weights",
     "download_backbone",
     "find_heads",
     "find_weights",
@@ -123,7 +124,7 @@ def read_weights(files: tuple[Path, ...], net: LpipsNet) -> dict[str, Tensor]:
         net: backbone.
 
     Raises:
-        WeightsError: when a file cannot be read, or an array is missing.
+        WeightsError: when a file cannot be read, or an array is missing or of another shape.
     """
     said = " and ".join(str(file) for file in files)
     if len(files) == 1:
@@ -149,8 +150,36 @@ def read_weights(files: tuple[Path, ...], net: LpipsNet) -> dict[str, Tensor]:
             f"{said}: not the weights of LPIPS with {net}; {missing[0]} "
             f"and {len(missing) - 1} more arrays are missing"
         )
+    wrong = misshapen_array(net, {name: tuple(weights[name].shape) for name in names})
+    if wrong is not None:
+        raise WeightsError(
+            f"{said}: not the weights of LPIPS with {net}; {wrong} has the shape "
+            f"{tuple(weights[wrong].shape)}, which does not fit the arrays before it"
+        )
     # Torchvision's files hold the classifiers too, most of VGG16's 528 MB.
     return {name: weights[name] for name in names}
+
+
+def check_weights(files: tuple[Path, ...], net: LpipsNet) -> None:
+    """Make sure that weights can be read: a damaged file is there as well as a whole one.
+
+    Files that have not changed are read once: a tenth of a second each.
+
+    Args:
+        files: what `find_weights` found.
+        net: backbone.
+
+    Raises:
+        WeightsError: when a file is damaged, or does not hold this network.
+    """
+    states = [file.stat() for file in files]
+    _check(files, net, tuple((state.st_size, state.st_mtime_ns) for state in states))
+
+
+@lru_cache(maxsize=8)
+def _check(files: tuple[Path, ...], net: LpipsNet, states: tuple[tuple[int, int], ...]) -> None:
+    """Read weights; sizes and times of change are part of the cache's key. What is raised is not kept."""
+    read_weights(files, net)
 
 
 def download_backbone(net: LpipsNet) -> Path:

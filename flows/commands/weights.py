@@ -25,8 +25,8 @@ def add_arguments(parser: Parser) -> None:
         "lpips",
         lpips,
         "where the weights of LPIPS are",
-        description="Say where the weights of each LPIPS backbone are, or what is missing; exit code 1 when "
-        "anything is. Nothing is downloaded unless --download asks for it.",
+        description="Say where the weights of each LPIPS backbone are, or what is missing or damaged; exit "
+        "code 1 when anything is. Nothing is downloaded unless --download asks for it.",
     )
     made.add_argument(
         "--nets",
@@ -45,10 +45,16 @@ def add_arguments(parser: Parser) -> None:
 
 
 def lpips(given: argparse.Namespace) -> int:
-    """`extrags weights lpips`; exit code 1 when weights are missing."""
+    """`extrags weights lpips`; exit code 1 when weights are missing or damaged."""
     set_up_logging(debug=given.debug, terminal=True, quiet=given.quiet)
     from extrags.errors import WeightsError
-    from extrags.metrics.lpips_weights import WEIGHTS_VARIABLE, download_backbone, find_heads, find_weights
+    from extrags.metrics.lpips_weights import (
+        WEIGHTS_VARIABLE,
+        check_weights,
+        download_backbone,
+        find_heads,
+        find_weights,
+    )
 
     named = os.environ.get(WEIGHTS_VARIABLE, "")
     # Where the variable names a folder, no other place is searched.
@@ -66,6 +72,11 @@ def lpips(given: argparse.Namespace) -> int:
                 continue
             download_backbone(net)
             files = find_weights(None, net)
+        try:
+            check_weights(files, net)
+        except WeightsError as error:
+            case["missing"] = f"damaged: {error}"
+            continue
         case["files"] = [str(file) for file in files]
     if given.json != "-":
         from flows.terminal import console

@@ -57,6 +57,13 @@ class TestRoundTrip:
         np.testing.assert_array_equal(back.points_rgb, varied.points_rgb)
         assert back.observed is not None
 
+    def test_decimals_have_their_place(self, clip, tmp_path, binary) -> None:
+        names = tuple(f"t{number * 0.05:g}s" for number in range(len(clip)))
+        write_colmap(replace(clip, frame_names=names), tmp_path / "scene", binary=binary)
+        back = read(tmp_path / "scene")
+        assert back.frame_names == names
+        np.testing.assert_array_equal(back.rgb, clip.rgb)
+
     def test_colmap_to_sequence_to_colmap(self, varied, tmp_path, binary) -> None:
         write_colmap(varied, tmp_path / "first", binary=binary)
         write_colmap(read(tmp_path / "first"), tmp_path / "second", binary=not binary)

@@ -80,6 +80,18 @@ class TestNumbersOfNames:
         with pytest.raises(SourceError, match=r"depth/frame-000000a\.png, frame frame-000001\.png"):
             read(tmp_path)
 
+    def test_decimals_stay_with_their_frames(self, clip, tmp_path) -> None:
+        self.written(clip, tmp_path, "depth")
+        expected = read(tmp_path)
+        for part in ("images", "depth"):
+            for k, file in enumerate(sorted((tmp_path / part).iterdir())):
+                file.rename(file.with_stem(f"{k * 0.05:g}"))
+        found = read(tmp_path)
+        assert found.frame_names == tuple(f"{k * 0.05:g}" for k in range(len(found)))
+        np.testing.assert_array_equal(found.rgb, expected.rgb)
+        np.testing.assert_array_equal(found.depth_mm, expected.depth_mm)
+        assert source_fingerprint(tmp_path)["order"] == "decimals"
+
     @pytest.mark.parametrize("renamed", ["{}.depth", "depth-{}", "0007_{}_96", "{}_77", "d"])
     def test_names_may_differ_otherwise(self, clip, tmp_path, renamed) -> None:
         self.written(clip, tmp_path, "depth")

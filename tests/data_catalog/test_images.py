@@ -14,9 +14,6 @@ from data_catalog.image_pages import pages_in
 from data_catalog.images import (
     UPRIGHT,
     color_files,
-    file_key,
-    natural_key,
-    order_for_fingerprint,
     orientation,
     read_color,
     read_depth,
@@ -94,6 +91,37 @@ def test_floating_point_has_no_white(tmp_path: Path) -> None:
     file = written(tmp_path / "a.tif", GREY.astype(np.float32))
     with pytest.raises(SourceError, match=r"a\.tif, frame 7, field rgb: floating-point values; expected"):
         read_color(file, frame=7)
+
+
+@pytest.mark.parametrize(
+    ("pixels", "told"),
+    [
+        (np.zeros((8, 9, 3), np.float32), "colours in floating-point numbers of 32 bits, which are not read"),
+        (np.zeros((8, 9), np.float64), "grey in floating-point numbers of 64 bits, which are not read"),
+        (np.zeros((8, 9, 3), np.int16), "colours in signed integers of 16 bits, which are not read"),
+        (np.zeros((8, 9, 3), np.uint32), "colours in integers of 32 bits, which are not read"),
+    ],
+)
+def test_colours_that_are_not_read_are_said_to_be_of_their_kind(tmp_path: Path, pixels, told: str) -> None:
+    """Floating-point colours of 32 bits were refused as numbers of more than 32."""
+    file = written(tmp_path / "a.tif", pixels)
+    with pytest.raises(
+        SourceError, match=f"field rgb: {told}; expected integers of 8 or 16 bits without a s"
+    ):
+        read_color(file)
+    if pixels.ndim == 3:
+        with pytest.raises(
+            SourceError, match=r"field depth: 3 channels of .*; expected one number per pixel"
+        ):
+            read_depth(file)
+
+
+@pytest.mark.filterwarnings("ignore:Corrupt EXIF data")
+def test_a_tiff_whose_description_is_damaged_is_said_to_be_damaged(tmp_path: Path) -> None:
+    file = written(tmp_path / "a.tif", np.zeros((8, 9, 3), np.float32))
+    file.write_bytes(file.read_bytes()[:60])
+    with pytest.raises(SourceError, match=r"field rgb: .*damaged.* \(60 bytes\)"):
+        read_color(file)
 
 
 def test_a_tiff_that_is_not_read_is_not_said_to_be_no_image(tmp_path: Path) -> None:
@@ -223,24 +251,6 @@ class TestMasks:
     def test_black_of_a_jpeg_is_not_all_of_one_value(self, tmp_path: Path) -> None:
         noise = np.random.default_rng(0).integers(0, 6, (20, 30), dtype=np.uint8)
         assert not read_mask(written(tmp_path / "a.jpg", noise)).any()
-
-
-def test_natural_order() -> None:
-    names = ["f10.png", "f9.png", "f09b.png", "f1.png", "a.png"]
-    assert sorted(names, key=natural_key) == ["a.png", "f1.png", "f9.png", "f09b.png", "f10.png"]
-
-
-def test_a_suffix_has_no_place_in_the_order() -> None:
-    """Windows numbers copies so; the first was read last, as a blank comes before a dot."""
-    names = ["frame.png", "frame (0).png", "frame (2).JPG", "frame (10).png", "frame-1.png"]
-    assert sorted(set(names), key=file_key) == names
-    assert sorted(["b.2", "b.10", "b"], key=file_key) == ["b", "b.2", "b.10"]
-    assert sorted(["7.png", "007.png"], key=file_key) == ["007.png", "7.png"]
-
-
-def test_an_order_counts_in_a_cache_key_where_it_was_another() -> None:
-    assert order_for_fingerprint(["f10.png", "f9.png", "f_1.jpg", "f1.png"]) == {}
-    assert order_for_fingerprint(["f (2).png", "f.png"]) == {"order": "without suffixes"}
 
 
 def test_spread_keeps_both_ends() -> None:

@@ -106,6 +106,34 @@ class TestNumbering:
             (told,) = (finding for finding in findings if finding.topic == "missing frame")
             assert f"{len(left_out) + 1} on; all others are 1 apart" in told.sentence
 
+    @pytest.mark.parametrize(
+        ("names", "topic", "told"),
+        [
+            ([f"frame_{k / 10:.1f}" for k in range(24)], None, ""),
+            ([f"{k * 0.05:g}" for k in range(31)], None, ""),
+            ([f"t{k / 30:.3f}" for k in range(70)], None, ""),
+            ([f"{k / 30 + k % 3 / 100:.6f}" for k in range(70)], None, ""),
+            ([f"scan_1.{k}" for k in range(8, 20)], None, ""),
+            (
+                [f"frame_{k / 10:.1f}" for k in range(24) if k != 12],
+                "missing frame",
+                "0.2 on; all others are 0.1",
+            ),
+            ([f"{k * 0.05:g}" for k in range(31) if k != 9], "missing frame", "0.1 on; all others are 0.05"),
+            (
+                [f"{s}.{k:03d}" for s in (1, 2) for k in range(12)],
+                "series of frames",
+                "the numbering begins anew",
+            ),
+        ],
+    )
+    def test_decimals_are_numbers(self, clip, names, topic, told) -> None:
+        """After 0.9 the numbering was said to begin anew."""
+        sequence = replace(self.named(clip, list(range(len(names))), "{}"), frame_names=tuple(names))
+        findings = [f for f in diagnose(sequence, "source") if f.field == "frame names"]
+        assert [finding.topic for finding in findings] == ([] if topic is None else [topic])
+        assert all(told in finding.sentence for finding in findings)
+
     def test_frames_that_were_left_out_on_purpose_are_not_missing(self, clip, tmp_path) -> None:
         sequence = self.named(clip, [*range(12), *range(13, 31)], "{:04d}")
         assert not [f for f in diagnose(sequence, "source", thinned=True) if f.topic == "missing frame"]

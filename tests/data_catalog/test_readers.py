@@ -200,7 +200,10 @@ class TestFrames:
         ("content", "message"),
         [
             ({"fx": 0, "fy": 71, "cx": 41, "cy": 29}, "focal length fx = 0 px"),
-            ({"fx": 70}, "expected K, or fx"),
+            ({"fx": 70}, "field K: no fy, cx, cy; expected K, or fx, fy, cx, cy, or field_of_view_deg$"),
+            ({"focal": 72}, "field K: no K, no field_of_view_deg and no fx, fy, cx, cy; expected K, or fx"),
+            ({"fx": "wide", "fy": 71, "cx": 41, "cy": 29}, 'field fx: "wide"; expected a number$'),
+            ({"field_of_view_deg": None}, "field field_of_view_deg: null; expected a number$"),
             ({"field_of_view_deg": 200}, "200 degrees"),
             ({"K": [[1, 2], [3, 4]]}, "3 x 3"),
             ([70, 71, 41, 29], r"intrinsics\.json.*expected K, or fx.*found list"),

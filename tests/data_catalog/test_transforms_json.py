@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 from plyfile import PlyData, PlyElement
 
-from data_catalog.catalog import read, resolve
+from data_catalog.catalog import read, resolve, source_fingerprint
 from data_catalog.readers.colmap_model import write_colmap
 from data_catalog.readers.transforms_json import write_transforms
 from extrags.config import IngestConfig
@@ -94,6 +94,23 @@ class TestRoundTrip:
 
 
 class TestReading:
+    def test_decimals_have_their_place(self, clip, folder, edit) -> None:
+        def renamed(content) -> None:
+            for number, entry in enumerate(content["frames"]):
+                place = folder / entry["file_path"]
+                entry["file_path"] = f"images/{number * 0.05:g}.png"
+                place.rename(folder / entry["file_path"])
+            content["frames"].reverse()
+            for key in [key for key in content if key.endswith("_filenames")]:
+                del content[key]
+
+        edit(renamed)
+        found = read(folder)
+        assert found.frame_names == tuple(f"{number * 0.05:g}" for number in range(len(clip)))
+        same = np.abs(found.cameras.centers - clip.cameras.centers)
+        assert same.max() < 1e-9
+        assert source_fingerprint(folder)["order"] == "decimals"
+
     def test_recognised(self, folder) -> None:
         assert resolve(folder).format == "transforms"
 

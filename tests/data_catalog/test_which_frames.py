@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -206,6 +207,43 @@ def test_copies_that_windows_numbers_are_read_in_order(tmp_path) -> None:
     assert read(tmp_path).frame_names == ("frame", *(f"frame ({k})" for k in range(2, 10)))
     assert not [finding for finding in inspect(tmp_path).findings if finding.topic == "order of frames"]
     assert source_fingerprint(tmp_path)["order"] == "without suffixes"
+
+
+class TestDecimals:
+    """Frames named by their times stood in the order 0, 0.1, 0.2, ..., 0.05."""
+
+    @staticmethod
+    def renamed(folder: Path, name: Callable[[int], str]) -> list[str]:
+        names = [name(int(file.stem)) for file in sorted(folder.iterdir())]
+        for file, new in zip(sorted(folder.iterdir()), names, strict=True):
+            file.rename(folder / f"{new}.png")
+        return names
+
+    @pytest.mark.parametrize("pattern", ["{:g}", "t{:g}s"])
+    def test_are_read_in_order(self, tmp_path, pattern) -> None:
+        write_frames(tmp_path, 24)
+        expected = read(tmp_path)
+        assert "order" not in source_fingerprint(tmp_path)
+        names = self.renamed(tmp_path, lambda number: pattern.format(number * 0.05))
+        found = read(tmp_path)
+        assert found.frame_names == tuple(names)
+        np.testing.assert_array_equal(found.rgb, expected.rgb)
+        assert source_fingerprint(tmp_path)["order"] == "decimals"
+        assert not [f for f in inspect(tmp_path).findings if f.field == "frame names"]
+
+    def test_of_both_cameras(self, tmp_path) -> None:
+        for camera in ("left", "right"):
+            write_frames(tmp_path / camera, 24)
+            names = self.renamed(tmp_path / camera, lambda number: f"{number * 0.05:g}")
+        images = frames_folder.READER.frames(tmp_path, IngestConfig())
+        assert [frame.file.stem for frame in images.frames] == names
+        assert source_fingerprint(tmp_path)["order"] == "decimals"
+
+    def test_what_nothing_tells_is_a_finding(self, tmp_path) -> None:
+        write_frames(tmp_path, 8)
+        self.renamed(tmp_path, lambda number: f"1.{(2, 3, 7, 11, 25, 35, 112, 216)[number]}")
+        (told,) = (f for f in inspect(tmp_path).findings if f.topic == "order of frames")
+        assert "1.7.png is read before 1.11.png" in told.sentence
 
 
 def test_pages_that_are_not_read_are_told(tmp_path, caplog) -> None:

@@ -14,6 +14,7 @@ import pytest
 
 from extrags.config import EnhanceConfig
 from extrags.errors import ConfigError, WeightsError
+from extrags.metrics.lpips_weights import WEIGHTS_VARIABLE
 from extrags.raster.native import usable_isas
 from extrags.store import Ref, Store
 from flows.benchmark import benchmark
@@ -94,6 +95,19 @@ class TestSentences:
         assert code == 1
         assert "no/such.npz" in said
 
+    def test_damaged_weights_of_lpips(
+        self, run: Callable[..., tuple[int, str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """They were found out when the scene was evaluated, after everything else."""
+        damaged = tmp_path / "weights" / "lpips_alex_v0.1.npz"
+        damaged.parent.mkdir()
+        damaged.write_bytes(b"PK" + bytes(998))
+        monkeypatch.setenv(WEIGHTS_VARIABLE, str(damaged.parent))
+        for settings in ([], [f"evaluate.lpips_weights={damaged}"]):
+            code, said = run(*settings)
+            assert code == 1
+            assert said.startswith(f"{damaged}: not a readable npz file")
+
     def test_an_instruction_set(self, tmp_path: Path) -> None:
         """In a process of its own: the kernels read the variable once."""
         command = "import sys; from flows.cli import main; sys.exit(main(sys.argv[1:]))"
@@ -121,6 +135,27 @@ class TestWhatIsLookedFor:
         for until in ("enhance", "report"):
             with pytest.raises(WeightsError, match="no/such"):
                 preflight(config, until)
+
+    def test_a_place_of_weights_that_is_not_there(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path / "nowhere"))
+        config = pipeline_config("quick")
+        for _ in range(2):
+            preflight(config, "report")
+        (told,) = [record for record in caplog.records if record.name == "flows.preflight"]
+        assert told.levelname == "WARNING"
+        assert re.search(r"names .*nowhere, which does not exist; .* with alex stay empty", told.getMessage())
+
+    def test_no_weights_of_lpips_are_looked_for_before_they_are_needed(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        damaged = tmp_path / "mine.npz"
+        damaged.write_bytes(b"PK")
+        monkeypatch.setenv(WEIGHTS_VARIABLE, str(damaged))
+        preflight(pipeline_config("quick"), "explore")
+        with pytest.raises(WeightsError, match=r"mine\.npz: not a readable npz file"):
+            preflight(pipeline_config("quick"), "report")
 
     @pytest.mark.usefixtures("prefect_server")
     def test_a_benchmark_looks_before_its_first_run(self, tmp_path: Path) -> None:

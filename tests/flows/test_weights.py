@@ -110,6 +110,19 @@ class TestCommand:
         assert [case["net"] for case in found] == ["alex", "vgg"]
         assert [Path(*case["files"]).name for case in found] == ["lpips_alex_v0.1.npz", "lpips_vgg_v0.1.npz"]
 
+    def test_says_what_is_damaged(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        """A file of 1000 bytes was listed like a whole one."""
+        damaged = tmp_path / "lpips_alex_v0.1.npz"
+        damaged.write_bytes(b"PK" + bytes(998))
+        monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path))
+        assert main(["weights", "lpips", "--nets", "alex", "--json", "-"]) == 1
+        (found,) = json.loads(capsys.readouterr().out)
+        assert undocumented_items([found], "a-network") == []
+        assert found["files"] == []
+        assert found["missing"].startswith(f"damaged: {damaged}: not a readable npz file")
+
     def test_downloads_only_when_told_to(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
     ) -> None:

@@ -87,7 +87,7 @@ class TestGrowBranch:
     def test_reaches_its_length_and_gains(self):
         found = branch()
         assert len(found) == 5
-        assert found.reason == "reached 5 views"
+        assert found.reason == "reached 4 virtual views"
         assert found.anchor == START
         assert len(found.moves) == len(found.values) == 4
         np.testing.assert_array_equal(found.poses[0], small_tube().cameras.world_from_camera[START])
@@ -171,7 +171,7 @@ class TestGrowBranch:
         ready, turns = disc_context()
         n = len(ready.scene.gaussians)
         found = grow_branch(ready, np.eye(4), np.zeros(n, np.uint32))
-        assert found.reason == "no further move is possible after 2 views"
+        assert found.reason == "no further move is possible after 1 virtual view"
         assert found.expansions == 5
         assert found.moves[0].startswith("turn")
         # The best of the four dead ends is kept.
@@ -202,14 +202,14 @@ class TestGrowBranch:
         found = branch(length=16, max_expansions=3)
         assert found.expansions == 3
         assert len(found) == 4
-        assert found.reason == "budget of 3 expansions spent, 4 views"
+        assert found.reason == "budget of 3 expansions spent, 3 virtual views"
 
     def test_no_way_out_is_told(self):
         space = small_freespace()
         closed = replace(space, occupancy=np.full_like(space.occupancy, OCCUPIED))
         found = branch_of(context_in(closed))
         assert len(found) == 1
-        assert found.reason == "no further move is possible after 1 views"
+        assert found.reason == "no further move is possible after 0 virtual views"
 
     def test_round_trip_on_disk(self, tmp_path):
         found = branch()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,13 @@ from extrags.errors import ConfigError, ShapeError, WeightsError
 from extrags.metrics import lpips as lpips_module
 from extrags.metrics import lpips_weights as weights_module
 from extrags.metrics.lpips import Lpips, TargetActivations, available_lpips
-from extrags.metrics.lpips_weights import WEIGHTS_VARIABLE, download_backbone, find_weights, read_weights
+from extrags.metrics.lpips_weights import (
+    WEIGHTS_VARIABLE,
+    check_weights,
+    download_backbone,
+    find_weights,
+    read_weights,
+)
 from tests.extrags.random_lpips import random_weights
 
 
@@ -189,6 +196,20 @@ def test_wrong_files_are_refused(tmp_path: Path, weights_folder: Path) -> None:
         Lpips.load(tmp_path / "text.npz")
     with pytest.raises((ConfigError, TypeCheckError), match=r"known: alex, vgg, squeeze|Type-check"):
         find_weights(None, "resnet")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("name", "shape"),
+    [("features.3.weight", (192, 63, 5, 5)), ("features.6.bias", (383,)), ("lin4", (255,)), ("lin0", ())],
+)
+def test_arrays_of_other_shapes_are_refused(tmp_path: Path, name: str, shape: tuple[int, ...]) -> None:
+    weights = {key: value.numpy() for key, value in random_weights("alex").items()}
+    file = tmp_path / "mine.npz"
+    np.savez(file, **weights)
+    check_weights((file,), "alex")
+    np.savez(file, **{**weights, name: np.zeros(shape, np.float32)})
+    with pytest.raises(WeightsError, match=rf"mine\.npz: .*; {name} has the shape {re.escape(str(shape))}"):
+        check_weights((file,), "alex")
 
 
 def as_pytorch_has_it(
