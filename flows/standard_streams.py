@@ -39,7 +39,8 @@ class _Output(io.FileIO):
 def set_up_streams() -> None:
     """Give this process streams that can be written, in any encoding; for the main thread, at the start.
 
-    Characters that an encoding lacks are written by their number, in ASCII. What was closed by the caller goes nowhere.
+    Characters that an encoding lacks are written by their number, in ASCII. What goes to a stream that the
+    caller has closed is lost.
     """
     if sys.stdout is None or sys.stderr is None:
         # Files that are opened later would take the places of the closed streams, and native code and
@@ -65,7 +66,7 @@ def set_up_streams() -> None:
 
 
 def _nowhere() -> TextIO:
-    return open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - it stays open as long as the process
+    return open(os.devnull, "w", encoding="utf-8")
 
 
 def output_refusal() -> OSError | None:
