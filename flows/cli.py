@@ -139,13 +139,21 @@ def _answered(arguments: Sequence[str]) -> int:
             return FAILED
         if "--debug" in arguments:
             raise
+        from extrags.data_directories import check_home
         from extrags.errors import ConfigError, UnknownSequenceError
         from extrags.redaction import without_credentials
         from flows.failures import describe_error
 
-        for line in describe_error(error):
+        shown = error
+        if isinstance(error, RuntimeError) and "home directory" in str(error):
+            # Packages look for it while they are imported.
+            try:
+                check_home()
+            except ConfigError as unknown:
+                shown = unknown
+        for line in describe_error(shown):
             _say(without_credentials(line))
-        return USAGE if isinstance(error, ConfigError | UnknownSequenceError) else FAILED
+        return USAGE if isinstance(shown, ConfigError | UnknownSequenceError) else FAILED
 
 
 def _say(line: str) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from extrags.data_directories import check_home
 from extrags.errors import StoreError
 
 __all__ = ["has_own_home", "prepare", "without_heartbeat"]
@@ -30,7 +31,9 @@ def prepare(state: Path, *, debug: bool = False) -> None:
 
     Raises:
         StoreError: when the directory cannot be made.
+        ConfigError: without a home folder.
     """
+    check_home()
     chosen = {
         "OMP_WAIT_POLICY": "passive",
         # Without an API URL the run gets a temporary server (`flows.temporary_server`). Prefect's start-up

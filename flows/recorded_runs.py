@@ -16,6 +16,7 @@ from extrags.errors import ConfigError, StoreError, UnknownSequenceError
 from extrags.pipeline import HELD_OUT_TRAINED_ON
 from extrags.report.leaderboard import BoardRow
 from extrags.store import Manifest, Ref, Store
+from extrags.user_paths import expanded
 from flows.outcome_records import (
     OutcomeRecord,
     held_out_trained_on,
@@ -389,7 +390,7 @@ def _address(place: str, target: str) -> str:
         return place
     page = Path(place).absolute()
     if target:
-        folder = Path(target).expanduser().absolute().parent
+        folder = expanded(target).absolute().parent
         shared = os.path.commonpath([page, folder]) if page.anchor == folder.anchor else page.anchor
         if shared != page.anchor:
             return quote(Path(os.path.relpath(page, folder)).as_posix())

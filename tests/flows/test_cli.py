@@ -75,6 +75,24 @@ class TestStart:
         assert said.stderr == "extrags: standard output cannot be written: No space left on device\n"
         assert shell(f"{verb} >/dev/full 2>/dev/full").returncode == 1
 
+    @pytest.mark.parametrize("verb", ["run phantom/0@sparse", "cache gc", "report phantom/0@sparse"])
+    def test_without_a_home_folder_one_sentence_names_the_variable(self, verb: str, tmp_path: Path) -> None:
+        code = (
+            "import os, pwd, sys\n"
+            "del os.environ['HOME']\n"
+            "def unknown(*_): raise KeyError('uid not found')\n"
+            "pwd.getpwuid = unknown\n"
+            "from flows.cli import main\n"
+            "sys.exit(main())\n"
+        )
+        command = [sys.executable, "-c", code, *verb.split(), "--store", str(tmp_path)]
+        said = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert said.returncode == 2
+        assert (
+            said.stderr
+            == "extrags: no home folder is known of this user; set HOME to a folder that can be written\n"
+        )
+
     @pytest.mark.parametrize("encoding", ["latin-1", "ascii"])
     def test_any_encoding_will_do(self, encoding: str, tmp_path: Path) -> None:
         said = shell(f'status --store "{tmp_path}"', {"PYTHONIOENCODING": encoding})
@@ -132,6 +150,8 @@ class TestUsage:
         [
             (["phantom/0@spars"], "no setting 'spars'"),
             (["fantom/0@sparse"], "Did you mean phantom/0@sparse"),
+            (["~rec.mp4"], "no such file or folder: "),
+            (["@~list.txt"], "the manifest ~list.txt cannot be read"),
             ([SEQUENCE, "--set", "coarse.iteration=1"], "did you mean coarse.iterations"),
             ([SEQUENCE, "--set", "coarse.iterations=-1"], "coarse.iterations"),
             ([SEQUENCE, "--set", "coarse.iterations"], "expected NAME=VALUE"),
