@@ -190,6 +190,25 @@ class TestUsage:
         assert said.count("\n") == 1
         assert not (tmp_path / "store" / "artefacts").exists()
 
+    @pytest.mark.parametrize(
+        ("variable", "message"),
+        [
+            ("EXTRAGS_RUN_PAGE", "EXTRAGS_RUN_PAGE is 'maybe'; expected 0 or 1"),
+            ("EXTRAGS_VERIFY", "EXTRAGS_VERIFY is 'maybe'; expected all or metadata"),
+        ],
+    )
+    def test_wrong_values_in_the_environment(
+        self,
+        variable: str,
+        message: str,
+        tmp_path: Path,
+        monkeypatch: pytest.MonkeyPatch,
+        capsys: pytest.CaptureFixture[str],
+    ) -> None:
+        monkeypatch.setenv(variable, "maybe")
+        assert main(["run", SEQUENCE, "--store", str(tmp_path / "store")]) == 2
+        assert message in capsys.readouterr().err
+
     def test_debug_shows_where(self, tmp_path: Path) -> None:
         with pytest.raises(ConfigError):
             main(["run", SEQUENCE, "--seed", "-1", "--debug", "--store", str(tmp_path)])
