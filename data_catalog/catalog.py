@@ -29,6 +29,7 @@ from extrags.errors import ConfigError, SourceNotFoundError, UnknownSequenceErro
 from extrags.redaction import without_credentials
 from extrags.scarce_depth import without_scarce_depth
 from extrags.sequence import EndoscopicSequence
+from extrags.user_paths import expanded
 
 __all__ = [
     "DATASETS",
@@ -200,7 +201,7 @@ def source_fingerprint(source: Source | str | Path, config: IngestConfig | None 
         found = {**found, "stereo_camera": config.stereo_camera}
     if config.calibration is None:
         return found
-    file = Path(config.calibration).expanduser()
+    file = expanded(config.calibration)
     if not file.is_file():
         raise SourceNotFoundError("no such calibration file", file=file, field="ingest.calibration")
     told = {"calibration": file_digests([("calibration", file)]), "calibration_version": CALIBRATION_VERSION}
@@ -284,7 +285,7 @@ def _unknown(name: str) -> UnknownSequenceError:
     if "://" in name:
         # Before it is taken for a path: one slash less, and its password would be no credential any more.
         return UnknownSequenceError(f"{without_credentials(name)} is a URL; sequences are files or folders")
-    place = Path(name).expanduser()
+    place = expanded(name)
     if place.exists():
         return UnknownSequenceError(f"{name} is a file or folder, and no name of the catalogue")
     if place.suffix.lower() in (*VIDEO_SUFFIXES, *DICOM_SUFFIXES) or name.startswith((".", "/", "~")):

@@ -106,11 +106,12 @@ def check_axes(sequence: EndoscopicSequence, *, file: object = None) -> None:
     if not pairs:
         return
     poses = np.asarray(sequence.world_from_camera, dtype=np.float64)
-    as_given = _reprojection_error(sequence, poses, pairs)
+    seen = _seen_points(sequence, pairs)
+    as_given = _reprojection_error(sequence, poses, pairs, seen)
     if as_given < _SUSPICIOUS_ERROR:
         return
     _refuse_intrinsics_of_another_size(sequence, as_given, file)
-    fits = [(_reprojection_error(sequence, read, pairs), name) for name, read in other_readings(poses)]
+    fits = [(_reprojection_error(sequence, read, pairs, seen), name) for name, read in other_readings(poses)]
     best_error, _ = min(fits)
     # Along a narrow part of the image another reading fits by chance, though not as well as the right one.
     convincing = _CONVINCING_ERROR if _are_wide(sequence, pairs) else _SUSPICIOUS_ERROR
@@ -147,7 +148,8 @@ def check_depth_scale(sequence: EndoscopicSequence, *, file: object = None) -> N
     if not pairs:
         return
     poses = np.asarray(sequence.world_from_camera, dtype=np.float64)
-    as_given = _reprojection_error(sequence, poses, pairs)
+    seen = _seen_points(sequence, pairs)
+    as_given = _reprojection_error(sequence, poses, pairs, seen)
     if as_given < _SUSPICIOUS_ERROR:
         return
 
@@ -157,7 +159,7 @@ def check_depth_scale(sequence: EndoscopicSequence, *, file: object = None) -> N
         # Depth times a factor beside these poses is this depth beside poses that move by less.
         moved = poses.copy()
         moved[:, :3, 3] /= factor
-        return _reprojection_error(sequence, moved, pairs)
+        return _reprojection_error(sequence, moved, pairs, seen)
 
     errors = np.array([error_with(float(factor)) for factor in _DEPTH_FACTORS])
     factor, best = float(_DEPTH_FACTORS[errors.argmin()]), float(errors.min())
@@ -278,45 +280,67 @@ def _are_wide(sequence: EndoscopicSequence, pairs: list[tuple[int, int]]) -> boo
 
 
 def _reprojection_error(
-    sequence: EndoscopicSequence, poses: Float[np.ndarray, "f 4 4"], pairs: list[tuple[int, int]]
+    sequence: EndoscopicSequence,
+    poses: Float[np.ndarray, "f 4 4"],
+    pairs: list[tuple[int, int]],
+    seen: list[Float[np.ndarray, "n 3"]] | None = None,
 ) -> float:
     """Relative difference of carried and found depth: median over a pair's points, mean over pairs.
 
     A pair of which too few points stay inside the image counts as 1.
+
+    Args:
+        sequence: with depth.
+        poses: one reading of them.
+        pairs: of frames.
+        seen: `_seen_points` of the pairs, where several readings are compared.
     """
     if sequence.depth_mm is None:
         return 0.0
-    return float(np.mean([1.0 if e is None else e for e in _pair_errors(sequence, poses, pairs)]))
+    return float(np.mean([1.0 if e is None else e for e in _pair_errors(sequence, poses, pairs, seen)]))
 
 
 def _pair_errors(
-    sequence: EndoscopicSequence, poses: Float[np.ndarray, "f 4 4"], pairs: list[tuple[int, int]]
+    sequence: EndoscopicSequence,
+    poses: Float[np.ndarray, "f 4 4"],
+    pairs: list[tuple[int, int]],
+    seen: list[Float[np.ndarray, "n 3"]] | None = None,
 ) -> list[float | None]:
     """Of each pair the median, at most 1; None where too few points stay inside the image."""
     if sequence.depth_mm is None:
         return []
+    cameras = sequence.cameras
     errors: list[float | None] = []
-    for first, second in pairs:
-        v, u = _checked_pixels(sequence.depth_mm[first], sequence.mask[first])
-        z = sequence.depth_mm[first][v, u].astype(np.float64)
-        known = (z > 0) & sequence.mask[first][v, u]
-        rays = unproject_pixels(
-            np.stack([u[known], v[known]], axis=1) + 0.5, sequence.K[first], sequence.lens
-        )
+    for (first, second), points in zip(pairs, seen or _seen_points(sequence, pairs), strict=True):
         relative = invert_poses(poses[second][None])[0] @ poses[first]
-        carried = transform_points(relative, rays * z[known, None])
+        carried = transform_points(relative, points)
         pixels = project_points(carried, sequence.K[second], sequence.lens)
-        inside = sequence.cameras.contains(pixels)
+        inside = cameras.contains(pixels)
         column, row = pixels[inside].astype(np.int64).T
         found = sequence.depth_mm[second][row, column]
         comparable = found > 0
-        if comparable.sum() < _MIN_INSIDE_SHARE * max(1, known.sum()):
+        if comparable.sum() < _MIN_INSIDE_SHARE * max(1, len(points)):
             errors.append(None)
             continue
         expected = found[comparable].astype(np.float64)
         relative_error = np.abs(carried[inside, 2][comparable] - expected) / expected
         errors.append(min(1.0, float(np.median(relative_error))))
     return errors
+
+
+def _seen_points(
+    sequence: EndoscopicSequence, pairs: list[tuple[int, int]]
+) -> list[Float[np.ndarray, "n 3"]]:
+    """Points of known depth of each pair's first frame, in its camera: the same for all readings of poses."""
+    assert sequence.depth_mm is not None
+    found = []
+    for first, _ in pairs:
+        v, u = _checked_pixels(sequence.depth_mm[first], sequence.mask[first])
+        z = sequence.depth_mm[first][v, u].astype(np.float64)
+        known = (z > 0) & sequence.mask[first][v, u]
+        centers = np.stack([u[known], v[known]], axis=1) + 0.5
+        found.append(unproject_pixels(centers, sequence.K[first], sequence.lens) * z[known, None])
+    return found
 
 
 def _checked_pixels(

@@ -36,6 +36,7 @@ from data_catalog.readers import (
 from extrags.config import IngestConfig
 from extrags.errors import ConfigError, SourceError, SourceNotFoundError
 from extrags.sequence import EndoscopicSequence
+from extrags.user_paths import expanded
 
 __all__ = ["READERS", "FolderDataset", "find_reader", "readers", "register_reader"]
 
@@ -109,7 +110,7 @@ class FolderDataset:
 
     def resolve(self, name_or_path: str) -> Source | None:
         """A path that exists, else a named set by its name or its folder's."""
-        path = Path(name_or_path).expanduser()
+        path = expanded(name_or_path)
         if path.exists():
             return self._source(path, _recognised(path))
         item = self.describe(name_or_path)
@@ -147,7 +148,7 @@ def _lenses(config: IngestConfig) -> Callable[[SourceFrames], SourceFrames]:
     def changed(source: SourceFrames) -> SourceFrames:
         if config.calibration is None:
             return source
-        return with_calibration_file(source, Path(config.calibration).expanduser())
+        return with_calibration_file(source, expanded(config.calibration))
 
     return changed
 

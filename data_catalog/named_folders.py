@@ -35,8 +35,10 @@ def not_on_this_machine(
         roots: where it was looked for; None for `data_roots()`.
     """
     looked_at = ", ".join(str(root) for root in (data_roots() if roots is None else roots))
+    # Without a home folder and the variable it is looked for nowhere.
+    where = f" in {looked_at}" if looked_at else ""
     return SourceNotFoundError(
-        f"{name} is not on this machine: no folder {folder} in {looked_at}. Put it there, set "
+        f"{name} is not on this machine: no folder {folder}{where}. Put it there, set "
         f"{DATA_VARIABLE} to the folder that holds it, or give {instead}",
         file=folder,
     )

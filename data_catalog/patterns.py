@@ -5,11 +5,11 @@ from __future__ import annotations
 import re
 from difflib import get_close_matches
 from fnmatch import fnmatchcase
-from pathlib import Path
 from typing import NamedTuple
 
 from data_catalog.catalog import list_sequences
 from extrags.errors import SourceNotFoundError, UnknownSequenceError
+from extrags.user_paths import expanded
 
 __all__ = ["Matched", "is_named", "is_pattern", "matching_names"]
 
@@ -30,7 +30,7 @@ class Matched(NamedTuple):
 
 def is_pattern(text: str) -> bool:
     """Whether a text is a pattern over names: it has `*`, `?` or `[`, and no such path exists."""
-    return re.search(r"[*?\[]", text) is not None and not Path(text).expanduser().exists()
+    return re.search(r"[*?\[]", text) is not None and not expanded(text).exists()
 
 
 def is_named(name: str, pattern: str) -> bool:

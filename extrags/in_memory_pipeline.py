@@ -11,13 +11,13 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from extrags.config import DEFAULT_PROFILE, PROFILES, PipelineConfig
 from extrags.errors import CaptureError, ConfigError
 from extrags.pipeline import Pipeline
 from extrags.stages import StageName, stages_until
+from extrags.user_paths import expanded
 
 if TYPE_CHECKING:
     from extrags.baselines.uc_nerf.training import UcNerfResult
@@ -404,7 +404,7 @@ class InMemoryPipeline(Pipeline):
         from extrags.splat_files.importing import import_scene
         from extrags.training import TrainingResult
 
-        found = import_scene(Path(file).expanduser(), self._training, self.config.imported)
+        found = import_scene(expanded(file), self._training, self.config.imported)
         gaussians = found.scene.gaussians
         self.config = self.config.of_imported_scene(
             count=len(gaussians), sh_degree=gaussians.sh_degree, lit=found.scene.light is not None

@@ -8,14 +8,15 @@ A verb is a module of `flows.commands` with `add_arguments`, which gives the par
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from importlib import import_module
 
 from flows.commands.options import Parser
 from flows.interruption import interruptible
 from flows.process_end import ProcessEnd
+from flows.standard_streams import output_refusal, set_up_streams, write_out
 
 __all__ = ["main", "parser"]
 
@@ -101,45 +102,65 @@ def main(arguments: Sequence[str] | None = None) -> int:
             (`flows.interruption`).
     """
     if arguments is None:
-        # Signals and the end belong to the process: they are handled where the command is all of it.
+        # Signals, streams and the end belong to the process: they are handled where the command is all of it.
+        set_up_streams()
         end = ProcessEnd()
         with interruptible():
             end.code = code = main(sys.argv[1:])
         return code
+    try:
+        code = _answered(arguments)
+    except SystemExit as ended:
+        # Of the parser, which has printed a help.
+        write_out()
+        if ended.code or output_refusal() is None:
+            raise
+        code = FAILED
+    except BaseException:
+        write_out()
+        raise
+    write_out()
+    refusal = output_refusal()
+    if refusal is None:
+        return code
+    _say(f"standard output cannot be written: {refusal.strerror}")
+    return code or FAILED
+
+
+def _answered(arguments: Sequence[str]) -> int:
+    """The exit code of a command; what made it fail is said."""
     try:
         return _run(arguments)
     except BrokenPipeError:
         # `extrags cache ls | head`: nothing is wrong.
         return OK
     except Exception as error:
+        if error is output_refusal():
+            return FAILED
         if "--debug" in arguments:
             raise
+        from extrags.data_directories import check_home
         from extrags.errors import ConfigError, UnknownSequenceError
         from extrags.redaction import without_credentials
         from flows.failures import describe_error
 
-        for line in describe_error(error):
-            print(f"extrags: {without_credentials(line)}", file=sys.stderr)
-        return USAGE if isinstance(error, ConfigError | UnknownSequenceError) else FAILED
-    finally:
-        _write_out()
+        shown = error
+        if isinstance(error, RuntimeError) and "home directory" in str(error):
+            # Packages look for it while they are imported.
+            try:
+                check_home()
+            except ConfigError as unknown:
+                shown = unknown
+        for line in describe_error(shown):
+            _say(without_credentials(line))
+        return USAGE if isinstance(shown, ConfigError | UnknownSequenceError) else FAILED
 
 
-def _write_out() -> None:
-    """Write what the streams still hold; it goes nowhere where the reader has gone.
-
-    Left to Python's own end, it would be written then, and fail with a message and an exit code of its own.
-    """
-    for stream in (sys.stdout, sys.stderr):
-        try:
-            stream.flush()
-        except BrokenPipeError:
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, stream.fileno())
-            os.close(nowhere)
-        except (OSError, ValueError):
-            # A full disk, or a closed stream: Python reports that in its own way.
-            pass
+def _say(line: str) -> None:
+    """Tell on standard error; where that cannot be written, the exit code alone tells."""
+    with suppress(OSError):
+        print(f"extrags: {line}", file=sys.stderr)
+    write_out()
 
 
 def _run(arguments: Sequence[str]) -> int:

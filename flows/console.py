@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+from rich.console import Console
 from rich.markup import escape
+from rich.measure import Measurement
 from rich.table import Table
 
 from flows.outcome import DatasetOutcome, SequenceOutcome
@@ -13,7 +17,7 @@ __all__ = ["print_failures", "print_outcomes", "print_plan"]
 
 
 def print_outcomes(run: DatasetOutcome, seconds: float) -> None:
-    """Print a table of results, one row per sequence."""
+    """Print a table of results, one row per sequence; in a narrow terminal, one line per figure."""
     out = console(error=True)
     table = Table(box=None, pad_edge=False, header_style="bold")
     table.add_column("sequence", overflow="fold")
@@ -23,18 +27,12 @@ def print_outcomes(run: DatasetOutcome, seconds: float) -> None:
     for name in columns:
         table.add_column(name, justify="right")
     for outcome in run.sequences:
-        states = [row.state for row in outcome.stages]
-        counts = ", ".join(
-            f"{states.count(state)} {state}"
-            for state in ("ran", "cached", "skipped", "failed")
-            if state in states
-        )
         coarse, final = (outcome.metrics.get(which) or {} for which in ("coarse", "final"))
         color = "green" if outcome.status == "ok" else "red"
         table.add_row(
             escape(outcome.title),
             f"[{color}]{outcome.status}[/]",
-            counts,
+            _counts(outcome),
             *(_change(name, coarse.get(name), final.get(name)) for name in columns),
         )
         if restored := outcome.metrics.get("restored"):
@@ -44,7 +42,14 @@ def print_outcomes(run: DatasetOutcome, seconds: float) -> None:
                 "",
                 *(_change(name, final.get(name), restored.get(name)) for name in columns),
             )
-    out.print(table)
+    # No word is broken but a name, which may be folded to a third of the width.
+    names = max((len(outcome.title) for outcome in run.sequences), default=0)
+    needed = Measurement.get(out, out.options.update(max_width=10_000), table).minimum
+    if needed - max(0, names - out.width // 3) <= out.width:
+        out.print(table)
+    else:
+        for outcome in run.sequences:
+            _print_lines(out, outcome, columns)
     print_failures(run)
     for outcome in run.sequences:
         if outcome.report:
@@ -52,6 +57,30 @@ def print_outcomes(run: DatasetOutcome, seconds: float) -> None:
     if run.report and len(run.sequences) > 1:
         out.print(f"all together: {run.report}", soft_wrap=True, markup=False)
     out.print(f"{seconds:.1f} s in all")
+
+
+def _counts(outcome: SequenceOutcome) -> str:
+    """How many of its stages came to which end."""
+    states = [row.state for row in outcome.stages]
+    return ", ".join(
+        f"{states.count(state)} {state}"
+        for state in ("ran", "cached", "skipped", "failed")
+        if state in states
+    )
+
+
+def _print_lines(out: Console, outcome: SequenceOutcome, columns: Sequence[str]) -> None:
+    """What the table has in a sequence's rows, below each other."""
+    color = "green" if outcome.status == "ok" else "red"
+    out.print(f"{escape(outcome.title)}: [{color}]{outcome.status}[/]", soft_wrap=True)
+    out.print(f"  {_counts(outcome)}", soft_wrap=True)
+    coarse, final, restored = (outcome.metrics.get(which) or {} for which in ("coarse", "final", "restored"))
+    # A table has a dash for what was not measured.
+    for name in (name for name in columns if coarse.get(name) is not None or final.get(name) is not None):
+        out.print(f"  {name} {_change(name, coarse.get(name), final.get(name))}", soft_wrap=True)
+        if restored:
+            change = _change(name, final.get(name), restored.get(name))
+            out.print(f"  [dim]{name}, restored[/] {change}", soft_wrap=True)
 
 
 def print_failures(run: DatasetOutcome) -> None:

@@ -29,6 +29,7 @@ from pydantic import BaseModel
 
 from extrags.config import PipelineConfig
 from extrags.errors import ConfigError
+from tasks.page_choice import PAGE_VARIABLE
 
 __all__ = ["ClusterTaskRunner", "needed_resources"]
 
@@ -40,7 +41,7 @@ PASSED_ON = (
     "PREFECT_API_AUTH_STRING",
     "PREFECT_LOGGING_LEVEL",
     "PREFECT_LOGGING_TO_API_ENABLED",
-    "EXTRAGS_RUN_PAGE",
+    PAGE_VARIABLE,
     "EXTRAGS_VERIFY",
 )
 """Variables that are the same on all workers as in the process of the run, or absent."""

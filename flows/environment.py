@@ -7,7 +7,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from extrags.data_directories import check_home
 from extrags.errors import StoreError
+from tasks.page_choice import PAGE_VARIABLE, page_chosen
 
 __all__ = ["has_own_home", "prepare", "without_heartbeat"]
 
@@ -30,7 +32,10 @@ def prepare(state: Path, *, debug: bool = False) -> None:
 
     Raises:
         StoreError: when the directory cannot be made.
+        ConfigError: without a home folder, or for a value of `EXTRAGS_RUN_PAGE` that it does not have.
     """
+    check_home()
+    page_chosen()  # What is wrong with it is said before anything runs.
     chosen = {
         "OMP_WAIT_POLICY": "passive",
         # Without an API URL the run gets a temporary server (`flows.temporary_server`). Prefect's start-up
@@ -51,9 +56,8 @@ def prepare(state: Path, *, debug: bool = False) -> None:
         except OSError as error:
             raise StoreError(f"the store {state} cannot be written: {error.strerror or error}") from error
         # Nobody looks at the page of a run on a server that goes with it.
-        # (The variable is `tasks.run_page.PAGE_VARIABLE`, which imports Prefect.)
         chosen["PREFECT_LOGGING_TO_API_ENABLED"] = "false"
-        chosen["EXTRAGS_RUN_PAGE"] = "0"
+        chosen[PAGE_VARIABLE] = "0"
         chosen["PREFECT_HOME"] = str(home)
     for name, value in chosen.items():
         os.environ.setdefault(name, value)

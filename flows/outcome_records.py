@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 from data_catalog.names import comparable_name
@@ -16,11 +16,15 @@ __all__ = [
     "outcome_records",
     "record_of",
     "recorded_name",
+    "recorded_page",
+    "report_key",
     "setting_text",
 ]
 
 OUTCOME = "outcome."
 """Begin of the names of these records."""
+REPORT = "report-v"
+"""Begin of the keys of a sequence's own pages."""
 
 OutcomeRecord = dict[str, Any]
 """`{sequence, path, method, profile, seed, variant, settings, until, status, stage, reason, ended, seconds,
@@ -58,6 +62,29 @@ def record_of(records: Mapping[str, OutcomeRecord], name: str, former_name: str)
         former_name: `flows.cases.SequenceCase.former_record`.
     """
     return records.get(name) or records.get(former_name)
+
+
+def report_key(name: str) -> str | None:
+    """The key of a page that is named by its file, its folder or itself; None for a sequence."""
+    parts = [part for part in name.replace("\\", "/").split("/") if part]
+    return next((part for part in reversed(parts[-2:]) if part.startswith(REPORT)), None)
+
+
+def recorded_page(store: Store, record: OutcomeRecord, there: Collection[str]) -> str | None:
+    """Where the page of a run on record is now; None where it has none, or not any more.
+
+    The record has the address of when it was written: the store may have been moved or copied since.
+
+    Args:
+        store: that holds the record.
+        record: of the run.
+        there: keys of the store's artefacts.
+    """
+    key = report_key(record["report"]) if record["report"] else None
+    if key is None or key not in there:
+        return None
+    file = str(record["report"]).rpartition("/")[2]
+    return f"{store.backend.uri(key)}/{file}"
 
 
 def held_out_trained_on(record: OutcomeRecord) -> bool:

@@ -12,6 +12,7 @@ from extrags.config import PipelineConfig
 from extrags.errors import WeightsError
 from extrags.metrics.registry import added_metrics
 from extrags.stages import stages_until
+from extrags.user_paths import expanded
 
 __all__ = ["preflight"]
 
@@ -70,7 +71,7 @@ def preflight(config: PipelineConfig, until: str, leave_out: Collection[str] = (
         # Here, because it loads torch, which looking up a deployment must not.
         from extrags.splat_files.reading import splat_format
 
-        splat_format(Path(config.imported.scene).expanduser())
+        splat_format(expanded(config.imported.scene))
     if "enhance" not in wanted:
         return
     # Here, because they load torch, which looking up a deployment must not.
@@ -82,7 +83,7 @@ def preflight(config: PipelineConfig, until: str, leave_out: Collection[str] = (
     for weights in found:
         if weights.paths:
             check_weights(tuple(map(Path, weights.paths)), weights.net)
-        elif named and not Path(named).expanduser().is_file():
+        elif named and not expanded(named).is_file():
             _say_once(f"{weights.reason}; figures of LPIPS with {weights.net} stay empty")
     first, *_ = found
     if "enhance" not in leave_out:

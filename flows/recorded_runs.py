@@ -16,11 +16,14 @@ from extrags.errors import ConfigError, StoreError, UnknownSequenceError
 from extrags.pipeline import HELD_OUT_TRAINED_ON
 from extrags.report.leaderboard import BoardRow
 from extrags.store import Manifest, Ref, Store
+from extrags.user_paths import expanded
 from flows.outcome_records import (
     OutcomeRecord,
     held_out_trained_on,
     outcome_records,
     recorded_name,
+    recorded_page,
+    report_key,
     setting_text,
 )
 
@@ -41,8 +44,6 @@ __all__ = [
     "run_names",
 ]
 
-REPORT = "report-v"
-"""Begin of the keys of a sequence's own pages."""
 DEFAULT_SEED = "default seeds"
 """In words: each stage has its own."""
 
@@ -121,7 +122,7 @@ def chosen_runs(
     found: dict[str, RecordedRun] = {}
     unfinished = 0
     for name in names:
-        key = _report_key(name)
+        key = report_key(name)
         if key is not None:
             manifest = _manifest(store, key)
             if manifest is None:
@@ -314,11 +315,13 @@ def board_rows(store: Store, patterns: Sequence[str] = (), target: str = "") -> 
         StoreError: when the store cannot be read.
     """
     rows = []
+    there = set(store.keys())
     for record in outcome_records(store).values():
         sequence = str(record["sequence"])
         if not _matches(sequence, patterns):
             continue
         seed, tree = record["seed"], record["metrics"]
+        page = recorded_page(store, record, there)
         rows.append(
             BoardRow(
                 sequence=sequence,
@@ -340,7 +343,7 @@ def board_rows(store: Store, patterns: Sequence[str] = (), target: str = "") -> 
                 seconds=sum(float(stage["made_seconds"]) for stage in record["stages"]),
                 metrics=tree.get("final") or tree.get("coarse"),
                 held_out_trained_on=held_out_trained_on(record),
-                link=_address(record["report"], target) if record["report"] else "",
+                link="" if page is None else _address(page, target),
             )
         )
     return sorted(rows, key=lambda row: (row.sequence, row.method, row.profile, row.seed, row.settings))
@@ -360,14 +363,8 @@ def _wanted(
     )
 
 
-def _report_key(name: str) -> str | None:
-    """The key of a page that is named by its file, its folder or itself; None for a sequence."""
-    parts = [part for part in name.replace("\\", "/").split("/") if part]
-    return next((part for part in reversed(parts[-2:]) if part.startswith(REPORT)), None)
-
-
 def _key_of(record: Mapping[str, Any]) -> str | None:
-    return _report_key(record["report"]) if record["report"] else None
+    return report_key(record["report"]) if record["report"] else None
 
 
 def _manifest(store: Store, key: str) -> Manifest | None:
@@ -393,7 +390,7 @@ def _address(place: str, target: str) -> str:
         return place
     page = Path(place).absolute()
     if target:
-        folder = Path(target).expanduser().absolute().parent
+        folder = expanded(target).absolute().parent
         shared = os.path.commonpath([page, folder]) if page.anchor == folder.anchor else page.anchor
         if shared != page.anchor:
             return quote(Path(os.path.relpath(page, folder)).as_posix())

@@ -23,7 +23,7 @@ from extrags.errors import ExtragsError
 from extrags.store import Ref, Store
 from flows.limits import StageLimits
 from tasks.progress import IN_PARALLEL, StageProgress, notify
-from tasks.stage import at, stage_key
+from tasks.stage import at, refreshing, stage_key
 
 __all__ = [
     "Call",
@@ -180,7 +180,7 @@ class DirectRunner:
 
     Args:
         store: root of the store.
-        refresh: make artefacts although they are there.
+        refresh: make artefacts although they are there; each is replaced when the new one is finished.
     """
 
     store: str
@@ -192,10 +192,10 @@ class DirectRunner:
         results = []
         for call in calls:
             key = stage_key(call.task, call.inputs)
-            if self.refresh:
-                store.rm(key)
-            found = store.find_or_set_aside(key)
-            ref = found or call.task.fn(store=self.store, label=label, **call.inputs)
+            found = None if self.refresh else store.find_or_set_aside(key)
+            # What is there stays until the new one takes its place: making it may be interrupted, or fail.
+            with refreshing() if self.refresh else nullcontext():
+                ref = found or call.task.fn(store=self.store, label=label, **call.inputs)
             results.append(Result(ref, "ran" if found is None else "cached"))
             _tell(calls, label, len(results))
         return results

@@ -17,6 +17,7 @@ from data_catalog.names import comparable_name, plain_name
 from data_catalog.patterns import is_pattern, matching_names
 from extrags.errors import ConfigError
 from extrags.store import digest_of
+from extrags.user_paths import expanded
 
 __all__ = ["Chosen", "absolute_manifests", "chosen_sequences"]
 
@@ -85,7 +86,7 @@ def chosen_sequences(given: Sequence[str]) -> list[Chosen]:
 def absolute_manifests(given: Sequence[str]) -> list[str]:
     """The same with absolute paths of manifests, for who reads them in another directory."""
     return [
-        f"{MANIFEST_MARK}{Path(text[1:]).expanduser().absolute()}" if text.startswith(MANIFEST_MARK) else text
+        f"{MANIFEST_MARK}{expanded(text[1:]).absolute()}" if text.startswith(MANIFEST_MARK) else text
         for text in given
     ]
 
@@ -93,7 +94,7 @@ def absolute_manifests(given: Sequence[str]) -> list[str]:
 def _without_manifests(given: Sequence[str]) -> Iterator[Chosen]:
     for text in given:
         if text.startswith(MANIFEST_MARK):
-            yield from _manifest(Path(text[1:]).expanduser())
+            yield from _manifest(expanded(text[1:]))
         else:
             yield Chosen(text)
 

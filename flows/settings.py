@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 import re
-from pathlib import Path
 from typing import Any
 
 from extrags.config import LARGEST_SEED, PipelineConfig, profile_config
 from extrags.cores import usable_cores
 from extrags.data_directories import DATA_VARIABLE, user_directories
 from extrags.errors import ConfigError, did_you_mean
+from extrags.user_paths import expanded
 
 __all__ = [
     "DEFAULT_STORE",
@@ -51,11 +51,11 @@ def run_store(named: str | None) -> str:
             _check_absolute(variable, os.environ.get(variable) or "/")
         _check_absolute("the parameter store", named or "/")
     root = named or os.environ.get(STORE_VARIABLE) or str(user_directories()[0] / "store")
-    return root if "://" in root else str(Path(root).expanduser().absolute())
+    return root if "://" in root else str(expanded(root).absolute())
 
 
 def _check_absolute(what: str, place: str) -> None:
-    if "://" not in place and not Path(place).expanduser().is_absolute():
+    if "://" not in place and not expanded(place).is_absolute():
         raise ConfigError(
             f"{what} is {place}, which is relative to where this worker was started; "
             "give an absolute path or a URL"

@@ -15,7 +15,7 @@ from extrags.stages import STAGES, all_tasks, stage_of_task, stages_until
 from extrags.store import Manifest, Store, in_work
 from extrags.store.manifest import stage_of
 from extrags.store.runs import Run, active_runs, runs_of
-from flows.outcome_records import OutcomeRecord, outcome_records, recorded_name, setting_text
+from flows.outcome_records import OutcomeRecord, outcome_records, recorded_name, recorded_page, setting_text
 from flows.selection import chosen_sequences
 
 __all__ = ["StageStatus", "StatusRow", "StoreStatus", "store_status"]
@@ -63,7 +63,7 @@ class StatusRow:
         ended: when its last run came to an end, UTC; empty where none is on record.
         psnr: of the final scene, in dB.
         stages: by name.
-        report: where its page is.
+        report: where its page is; None where there is none, or not any more.
     """
 
     sequence: str
@@ -190,7 +190,7 @@ def store_status(store: Store, patterns: Sequence[str] = ()) -> StoreStatus:
         if name in names:
             bytes_of |= {key: size for key, size in made.items() if key in there}
             row = _row(record, there, _making(record, making, going_on))
-            rows.append(replace(row, sequence=name))
+            rows.append(replace(row, sequence=name, report=recorded_page(store, record, there)))
     shown = {row.sequence for row in rows}
     for name in names:
         if name not in shown:
@@ -345,7 +345,6 @@ def _row(record: OutcomeRecord, there: set[str], running: set[str]) -> StatusRow
         ended=record["ended"],
         psnr=figure_of(record["metrics"].get("final"), "psnr"),
         stages=stages,
-        report=record["report"],
     )
 
 

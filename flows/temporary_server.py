@@ -35,6 +35,7 @@ from urllib.parse import quote
 
 from extrags.data_directories import cache_directory
 from extrags.errors import ExtragsError
+from extrags.user_paths import expanded
 
 if TYPE_CHECKING:
     import uvicorn
@@ -248,7 +249,7 @@ def database_address(environment: Mapping[str, str]) -> dict[str, str]:
     chosen = ("PREFECT_SERVER_DATABASE_", "PREFECT_API_DATABASE_")
     if home is None or any(name.startswith(chosen) for name in environment):
         return {}
-    database = Path(home).expanduser() / DATABASE
+    database = expanded(home) / DATABASE
     if _in_address(database) == str(database):
         return {}
     return {"PREFECT_SERVER_DATABASE_CONNECTION_URL": f"sqlite+aiosqlite:///{_in_address(database)}"}

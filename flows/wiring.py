@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from data_catalog.catalog import resolve, source_fingerprint
@@ -11,7 +12,7 @@ from extrags.errors import DamagedArtefactError
 from extrags.metrics.registry import added_metrics
 from extrags.pipeline import HELD_OUT_TRAINED_ON
 from extrags.stages import Part, StageName
-from extrags.store import Ref
+from extrags.store import Ref, Slot
 from flows.cached_stages import CachedStages
 from flows.continuation import coarse_call
 from flows.imported import imported_call, of_imported_scene
@@ -41,7 +42,7 @@ from tasks.freespace import freespace
 from tasks.ingest import ingest, training_frames
 from tasks.poses import estimating_settings, lens_settings, poses
 from tasks.report import PAGE, REPORT_PARTS, ROWS, report
-from tasks.stage import stage_key
+from tasks.stage import fill, stage_key
 from tasks.surface import surface
 from tasks.uc_nerf import render_uc_nerf, uc_nerf
 from tasks.weights import (
@@ -441,14 +442,26 @@ class SequenceRun(CachedStages):
     def report_again(self) -> None:
         """The page anew, with the times of the run that made what it shows, not those of looking it up."""
         with self._stage("report") as row:
-            inputs = self._page_inputs()
-            told = self._rows_of_page(stage_key(report, inputs))
-            if not told:
-                for item in inputs["rows"]:
-                    if item["state"] == "cached":
-                        item |= {"state": "ran", "seconds": item["made_seconds"]}
-            inputs["rows"] = told or inputs["rows"]
-            self._make_page(row, Call(report, inputs))
+            self._make_page(row, Call(report, self._inputs_of_page_again()))
+
+    def report_elsewhere(self, folder: Path) -> Path:
+        """As `report_again`, but the page is written to a folder outside the store, which stays as it is.
+
+        Returns:
+            The page.
+        """
+        fill(report, Slot(folder, self.store), self._inputs_of_page_again())
+        return folder / PAGE
+
+    def _inputs_of_page_again(self) -> dict[str, Any]:
+        inputs = self._page_inputs()
+        told = self._rows_of_page(stage_key(report, inputs))
+        if not told:
+            for item in inputs["rows"]:
+                if item["state"] == "cached":
+                    item |= {"state": "ran", "seconds": item["made_seconds"]}
+        inputs["rows"] = told or inputs["rows"]
+        return inputs
 
     def _make_page(self, row: StageRow, call: Call) -> None:
         self.refs["report"] = self._run_task(row, call)

@@ -9,6 +9,7 @@ from pathlib import Path
 from extrags.config import ImportedConfig
 from extrags.errors import ConfigError, SourceError, SourceNotFoundError
 from extrags.store import Ref, Slot
+from extrags.user_paths import expanded
 from tasks.coarse import HISTORY
 from tasks.stage import stage
 
@@ -24,7 +25,7 @@ def scene_digest(config: ImportedConfig) -> str:
     """
     if config.scene is None:
         raise ConfigError("imported.scene names no file")
-    file = Path(config.scene).expanduser()
+    file = expanded(config.scene)
     if not file.is_file():
         raise SourceNotFoundError("no such file", file=file, field="imported.scene")
     about = file.stat()
@@ -55,7 +56,7 @@ def imported_scene(slot: Slot, sequence: Ref, digest: str, scale: float, file: s
     config = ImportedConfig(scene=file, scale=scale)
     if scene_digest(config) != digest:
         raise SourceError("it changed while it was used", file=file, field="imported.scene")
-    found = import_scene(Path(file).expanduser(), slot.load(EndoscopicSequence, sequence), config)
+    found = import_scene(expanded(file), slot.load(EndoscopicSequence, sequence), config)
     slot.save(found.scene)
     slot.save_json(HISTORY, [])
     slot.counts.update(

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import math
-import os
 import re
 import threading
 import time
@@ -24,6 +23,7 @@ from uuid import UUID
 from prefect.artifacts import create_progress_artifact, update_progress_artifact
 from prefect.context import FlowRunContext, TaskRunContext
 
+from tasks.page_choice import page_chosen
 from tasks.progress import (
     Pace,
     ProgressLog,
@@ -34,7 +34,6 @@ from tasks.progress import (
 )
 
 __all__ = [
-    "PAGE_VARIABLE",
     "ArtifactSender",
     "StageBars",
     "artifact_key",
@@ -44,9 +43,6 @@ __all__ = [
 ]
 
 log = logging.getLogger(__name__)
-
-PAGE_VARIABLE = "EXTRAGS_RUN_PAGE"
-"""`0` for no progress and no pictures on the run's page."""
 
 UPDATE_SECONDS = 5.0
 """Artifacts are updated no more often."""
@@ -63,7 +59,7 @@ MAX_FAILURES = 3
 def page_wanted() -> bool:
     """Whether the current run has a page to write on: in a flow or task, and not switched off."""
     in_a_run = FlowRunContext.get() is not None or TaskRunContext.get() is not None
-    return in_a_run and os.environ.get(PAGE_VARIABLE, "1") != "0"
+    return in_a_run and page_chosen()
 
 
 def artifact_key(kind: str, *names: str) -> str:

@@ -16,7 +16,9 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from importlib import import_module
 from pkgutil import iter_modules
@@ -45,6 +47,8 @@ __all__ = [
     "StageKey",
     "all_stage_versions",
     "at",
+    "fill",
+    "refreshing",
     "stage",
     "stage_key",
     "stage_versions",
@@ -60,6 +64,7 @@ DEVICE = "device"
 """Parameter of stages that may run on a GPU: cpu or cuda. Their results differ by rounding: it counts."""
 
 _versions: dict[str, int] = {}
+_refresh: ContextVar[bool] = ContextVar("refresh", default=False)
 
 
 @dataclass
@@ -251,6 +256,18 @@ def _made(
     return slot.ref
 
 
+def fill(task: Task[..., Ref], slot: Slot, inputs: Mapping[str, Any]) -> None:
+    """Let a stage write into a slot that becomes no artefact, where the store itself cannot be written.
+
+    Args:
+        task: made by `stage`.
+        slot: of a folder outside the store that its inputs are read from.
+        inputs: the stage's own arguments, by name.
+    """
+    body: Callable[..., None] = inspect.unwrap(task.fn)
+    body(slot, **inputs)
+
+
 def at(task: Task[..., Ref], store: str, *, refresh: bool = False) -> Task[..., Ref]:
     """Configure a task to cache in a store, with locks so that only one process computes a key at a time.
 
@@ -302,9 +319,22 @@ def all_stage_versions() -> dict[str, int]:
     return stage_versions()
 
 
+@contextmanager
+def refreshing() -> Iterator[None]:
+    """In this block stages that are called without Prefect run although their artefacts are there.
+
+    An artefact stays until the new one is committed in its place.
+    """
+    token = _refresh.set(True)
+    try:
+        yield
+    finally:
+        _refresh.reset(token)
+
+
 def _refreshing() -> bool:
     transaction = get_transaction()
-    return transaction is not None and transaction.overwrite
+    return _refresh.get() or (transaction is not None and transaction.overwrite)
 
 
 def _split(inputs: Mapping[str, Any]) -> tuple[dict[str, Ref], dict[str, Any]]:

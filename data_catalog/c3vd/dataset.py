@@ -20,6 +20,7 @@ from data_catalog.posed_frames import assembled
 from extrags.config import IngestConfig
 from extrags.errors import SourceError
 from extrags.sequence import EndoscopicSequence
+from extrags.user_paths import expanded
 
 __all__ = ["C3vdDataset"]
 
@@ -47,7 +48,7 @@ class C3vdDataset:
 
     def resolve(self, name_or_path: str) -> Source | None:
         """A video or a pair by name, or a pair in a folder of its own, registered or not."""
-        path = Path(name_or_path).expanduser()
+        path = expanded(name_or_path)
         item = find(name_or_path)
         if item is not None:
             return self._source(item, None)

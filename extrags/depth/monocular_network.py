@@ -20,6 +20,7 @@ from torch.nn import functional
 
 from extrags.errors import MissingDependencyError, WeightsError, installed_with
 from extrags.model_files import fingerprint, missing_weights
+from extrags.user_paths import expanded
 
 __all__ = ["MonocularNetwork", "Preparation", "find_monocular", "load_monocular", "monocular_digest"]
 
@@ -146,7 +147,7 @@ def find_monocular(setting: str) -> Path:
         raise MissingDependencyError(
             f"depth.monocular needs transformers: not installed. Install with: {INSTALL}"
         )
-    folder = Path(setting).expanduser()
+    folder = expanded(setting)
     said = f"depth.monocular={setting}"
     if not folder.is_dir():
         raise WeightsError(

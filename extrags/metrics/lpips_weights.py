@@ -23,6 +23,7 @@ from extrags.config import LpipsNet
 from extrags.data_directories import weights_roots
 from extrags.errors import ConfigError, WeightsError, installed_with
 from extrags.metrics.lpips_networks import LAYERS, array_names, misshapen_array
+from extrags.user_paths import expanded
 
 __all__ = [
     "BACKBONES",
@@ -71,7 +72,7 @@ def find_weights(explicit: str | None = None, net: LpipsNet = "alex") -> tuple[P
     filename = f"lpips_{net}_v0.1.npz"
     for origin, text in (("the setting", explicit), (WEIGHTS_VARIABLE, os.environ.get(WEIGHTS_VARIABLE))):
         if text:
-            file = Path(text).expanduser()
+            file = expanded(text)
             folder = file.is_dir()
             file = file / filename if folder else file
             if not file.is_file():

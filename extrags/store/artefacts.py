@@ -24,6 +24,7 @@ from extrags.store.refusal import refused_write
 from extrags.store.slot import Slot
 from extrags.store.storable import Storable
 from extrags.store.url import UrlBackend
+from extrags.user_paths import expanded
 
 __all__ = ["Store"]
 
@@ -78,7 +79,7 @@ class Store:
             self.root = text.rstrip("/")
             self.backend = UrlBackend(self.root, cache)
         else:
-            directory = Path(text.removeprefix("file://")).expanduser().absolute()
+            directory = expanded(text.removeprefix("file://")).absolute()
             self.root = str(directory)
             self.backend = DirectoryBackend(directory)
 

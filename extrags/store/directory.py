@@ -202,6 +202,18 @@ class DirectoryBackend:
         (scratch / MANIFEST).write_bytes(manifest_text(manifest))
         target = self.artefacts / manifest.key
         target.parent.mkdir(parents=True, exist_ok=True)
+        replaced: list[Path] = []
+        try:
+            return self._in_place(scratch, target, manifest, renew, replaced)
+        finally:
+            # After the new one is in place: deleting a large one takes its time.
+            for aside in replaced:
+                shutil.rmtree(aside, ignore_errors=True)
+
+    def _in_place(
+        self, scratch: Path, target: Path, manifest: Manifest, renew: bool, replaced: list[Path]
+    ) -> Manifest:
+        """As `commit`; adds to `replaced` where the artefacts are that were in the way."""
         for _ in range(8):
             try:
                 scratch.rename(target)
@@ -217,7 +229,9 @@ class DirectoryBackend:
                     raise
                 # Other content, or a damaged artefact: `refresh` replaces it. Between the two renames
                 # the key is merely absent, which is a cache miss and never a half-written artefact.
-                self.discard(manifest.key)
+                aside = self._move_aside(manifest.key)
+                if aside is not None:
+                    replaced.append(aside)
         raise StoreError(f"artefact {manifest.key} is being replaced by others again and again")
 
     def discard(self, key: str) -> bool:
@@ -226,18 +240,25 @@ class DirectoryBackend:
         Raises:
             StoreError: when the store cannot be written.
         """
+        aside = self._move_aside(key)
+        if aside is None:
+            return False
+        shutil.rmtree(aside, ignore_errors=True)
+        return True
+
+    def _move_aside(self, key: str) -> Path | None:
+        """Rename an artefact to a name in `scratch/`, which is returned; None where there is none."""
         aside = self.scratch / f"{key}.{secrets.token_hex(4)}.removed"
         try:
             self.scratch.mkdir(parents=True, exist_ok=True)
             (self.artefacts / key).rename(aside)
         except FileNotFoundError:
-            return False
+            return None
         except OSError as error:
             raise StoreError(
                 f"{key} cannot be removed from {self.root}: {error.strerror or error}"
             ) from error
-        shutil.rmtree(aside, ignore_errors=True)
-        return True
+        return aside
 
     def sweep(self, older_than_hours: float, *, dry_run: bool = False) -> list[str]:
         """Remove scratch directories of killed processes, and artefact directories without a manifest."""

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from extrags.errors import ConfigError, ExtragsError, StoreError
 from extrags.redaction import CredentialFilter, without_credentials
+from extrags.user_paths import expanded
 from flows.commands.outputs import STANDARD_OUTPUT, write_output
 
 if TYPE_CHECKING:
@@ -234,7 +235,7 @@ def store_root(given: argparse.Namespace) -> str:
     from flows.settings import default_store
 
     root: str = given.store or default_store()
-    return root if "://" in root else str(Path(root).expanduser().absolute())
+    return root if "://" in root else str(expanded(root).absolute())
 
 
 def write_json(value: Any, target: str | None) -> None:

@@ -199,9 +199,12 @@ def _check(given: argparse.Namespace) -> None:
         raise ConfigError(f"--fps is {given.fps:g}; expected 0.1 to 1000")
     if given.width is not None and not 16 <= given.width <= 8192:
         raise ConfigError(f"--width is {given.width}; expected 16 to 8192")
-    for panel in [] if given.panels is None else given.panels.split(","):
+    panels = [] if given.panels is None else given.panels.split(",")
+    for panel in panels:
         if panel not in PANELS:
             raise ConfigError(f"--panels: no panel {panel!r}; known: {', '.join(PANELS)}")
+        if panels.count(panel) > 1:
+            raise ConfigError(f"--panels: {panel} is named twice")
     if given.along not in (None, *ALONG) and not Path(given.along).is_file():
         wanted = f"expected {', '.join(ALONG)} or a FILE.json"
         raise ConfigError(f"--along {given.along}: there is no such file; {wanted}")

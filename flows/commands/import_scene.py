@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 from extrags.errors import ConfigError, SourceNotFoundError
+from extrags.user_paths import expanded
 from flows.commands.options import Parser, add_json, add_method, add_runner, add_stages
 
 __all__ = ["add_arguments", "import_scene"]
@@ -41,7 +41,7 @@ def import_scene(given: argparse.Namespace) -> int:
     """`extrags import`."""
     from flows.commands.run import run
 
-    file = Path(given.file).expanduser().absolute()
+    file = expanded(given.file).absolute()
     if not file.is_file():
         raise SourceNotFoundError("no such file", file=file)
     for name in ("imported.scene", "imported.scale"):

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from extrags.errors import StoreError
 from extrags.output_files import write_file
+from extrags.user_paths import expanded
 
 __all__ = [
     "STANDARD_OUTPUT",
@@ -36,10 +37,11 @@ def output_place(text: str) -> str:
     Raises:
         ArgumentTypeError: when nothing can be made there.
     """
-    try:
-        place = Path(text).expanduser()
-    except RuntimeError as error:
-        raise ArgumentTypeError(f"{text} cannot be written: {error}") from error
+    place = expanded(text)
+    first, *within = place.parts or ("",)
+    if first.startswith("~") and within and not os.path.isdir(first):
+        # A file may be called so; a folder would be made for a user whose name is misspelled.
+        raise ArgumentTypeError(f"{text} cannot be written: there is no home folder and no folder {first}")
     if not text:
         raise ArgumentTypeError("expected a name")
     absolute = place.absolute()

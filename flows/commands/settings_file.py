@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from extrags.errors import ConfigError
+from extrags.user_paths import expanded
 
 __all__ = ["settings_of_file"]
 
@@ -54,7 +55,7 @@ def _content(file: Path) -> Mapping[Any, Any]:
     kind = "JSON" if file.suffix.lower() == ".json" else "YAML"
     try:
         # Editors on Windows put a mark at the beginning.
-        text = file.expanduser().read_text(encoding="utf-8-sig")
+        text = expanded(file).read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         problem = getattr(error, "strerror", None) or error
         raise ConfigError(f"--config {file} cannot be read: {problem}") from error

@@ -23,6 +23,8 @@ MARKS = {
     "missing": "[yellow]·[/]",
     "running": "[cyan]▶[/]",
 }
+PLAIN_MARKS = str.maketrans("✓✗·▶", "+x.>")
+"""For terminals and files whose encoding lacks one of these."""
 SHORT = 3
 """Letters of a stage's name above its column."""
 LEFT, RIGHT = ("sequence", "run", "state", "ended"), ("seconds", "PSNR", "size")
@@ -73,12 +75,17 @@ def _print(found: StoreStatus) -> None:
     from flows.terminal import console
 
     out = console()
+    marks = MARKS
+    try:
+        "".join(MARKS.values()).encode(out.encoding)
+    except UnicodeEncodeError:
+        marks = {state: mark.translate(PLAIN_MARKS) for state, mark in MARKS.items()}
     columns: dict[str, list[str]] = {"sequence": [escape(row.sequence) for row in found.rows]}
     if any(row.variant for row in found.rows):
         columns["run"] = [escape(row.variant) for row in found.rows]
     for stage in STAGES:
         columns[stage[:SHORT]] = [
-            MARKS[row.stages[stage].state] if stage in row.stages else "" for row in found.rows
+            marks[row.stages[stage].state] if stage in row.stages else "" for row in found.rows
         ]
     columns["state"] = [row.state for row in found.rows]
     columns["seconds"] = [f"{row.seconds:.0f}" if row.seconds else "" for row in found.rows]
@@ -106,9 +113,9 @@ def _print(found: StoreStatus) -> None:
     else:
         for place, row in enumerate(found.rows):
             where = f"{row.sequence} ({row.variant})" if row.variant else row.sequence
-            marks = "".join(columns[stage[:SHORT]][place] or " " for stage in STAGES)
+            line = "".join(columns[stage[:SHORT]][place] or " " for stage in STAGES)
             out.print(f"{where}: {row.state}", markup=False, soft_wrap=True)
-            out.print(f"  {marks}")
+            out.print(f"  {line}")
     for row in found.rows:
         if row.reason:
             where = f"{row.sequence} ({row.variant})" if row.variant else row.sequence
@@ -121,7 +128,7 @@ def _print(found: StoreStatus) -> None:
         soft_wrap=True,
         markup=False,
     )
-    legend = "   ".join(f"{mark} {state}" for state, mark in MARKS.items())
+    legend = "   ".join(f"{mark} {state}" for state, mark in marks.items())
     out.print(f"[dim]{legend}[/]")
 
 

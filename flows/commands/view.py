@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from extrags.errors import ConfigError, installed_with
+from extrags.user_paths import expanded
 from flows.commands.common import finished_run, run_config, set_up_logging
 from flows.commands.options import Parser, add_method
 from flows.interruption import until_told_to_stop
@@ -138,7 +139,7 @@ def _device(asked: str) -> str:
 def _from_file(given: argparse.Namespace) -> _Shown:
     from extrags.splat_files import read_splat_file
 
-    path = Path(given.sequence).expanduser()
+    path = expanded(given.sequence)
     return _Shown(path.name, read_splat_file(path), None)
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import argparse
 import os
-from pathlib import Path
 from typing import Any, get_args
 
 from extrags.errors import installed_with
+from extrags.user_paths import expanded
 from flows.commands.common import set_up_logging, write_json
 from flows.commands.options import Parser, add_json, add_verb
 
@@ -58,7 +58,7 @@ def lpips(given: argparse.Namespace) -> int:
 
     named = os.environ.get(WEIGHTS_VARIABLE, "")
     # Where the variable names a folder, no other place is searched.
-    elsewhere = not named or Path(named).expanduser().is_file()
+    elsewhere = not named or expanded(named).is_file()
     found: list[dict[str, Any]] = []
     for net in given.nets:
         case: dict[str, Any] = {"net": net, "files": [], "missing": ""}

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import pwd
 from pathlib import Path
 
 import pytest
 
 from data_catalog.catalog import list_sequences, resolve
-from extrags.data_directories import cache_directory, data_roots, user_directories, weights_roots
-from extrags.errors import SourceNotFoundError, WeightsError
+from extrags.data_directories import cache_directory, check_home, data_roots, user_directories, weights_roots
+from extrags.errors import ConfigError, SourceNotFoundError, WeightsError
 from extrags.metrics.lpips_weights import WEIGHTS_VARIABLE, find_weights
 from extrags.store.url import default_cache_directory
 
@@ -43,6 +44,27 @@ def test_xdg_variables_are_honoured(home: Path, tmp_path: Path, monkeypatch: pyt
     monkeypatch.setenv("XDG_DATA_HOME", "relative/data")
     monkeypatch.setenv("XDG_CACHE_HOME", "")
     assert user_directories() == [home / ".local/share/extrags", home / ".cache/extrags"]
+
+
+def test_without_a_home_folder_what_is_named_is_searched(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def unknown(*_: object) -> None:
+        raise KeyError("getpwuid(): uid not found")
+
+    monkeypatch.delenv("HOME")
+    monkeypatch.setattr(pwd, "getpwuid", unknown)
+    assert data_roots() == weights_roots("lpips") == []
+    for wanted in (cache_directory, user_directories, check_home):
+        with pytest.raises(ConfigError, match="set HOME to a folder that can be written"):
+            wanted()
+    with pytest.raises(SourceNotFoundError, match=r"no folder sinus_hopkins\. Put it there"):
+        resolve("sinus/hopkins")
+    monkeypatch.setenv("EXTRAGS_DATA", str(tmp_path / "sets"))
+    assert data_roots() == [tmp_path / "sets"]
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    assert user_directories() == [tmp_path / "data/extrags", tmp_path / "cache/extrags"]
 
 
 def test_the_folder_that_the_user_names_comes_first(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,7 +7,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import httpx
@@ -25,6 +25,18 @@ from tests.documented_json import undocumented
 from tests.flows.tiny import SEQUENCE, settled
 
 pytestmark = pytest.mark.usefixtures("untouched_environment")
+
+
+def shell(command: str, environment: Mapping[str, str] | None = None) -> subprocess.CompletedProcess[str]:
+    """What a command says in a process of its own, with the redirections of a shell."""
+    code = "import sys; from flows.cli import main; sys.exit(main())"
+    return subprocess.run(
+        ["sh", "-c", f"{sys.executable} -c '{code}' {command}"],
+        env={**os.environ, **(environment or {})},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
 
 
 class TestStart:
@@ -49,6 +61,47 @@ class TestStart:
         said = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True, check=False)
         os.close(writing)
         assert (said.returncode, said.stderr) == (0, "")
+
+    @pytest.mark.parametrize("closed", [">&-", "2>&-", ">&- 2>&-"])
+    def test_closed_streams_change_no_exit_code(self, closed: str, tmp_path: Path) -> None:
+        for verb, code in (("status", 0), ("cache ls", 0), ("cache nonsense", 2)):
+            said = shell(f'{verb} --store "{tmp_path}" {closed}')
+            assert (said.returncode, "Traceback" in said.stdout + said.stderr) == (code, False), verb
+
+    @pytest.mark.parametrize("verb", ["--help", "--version", "data list", "data list --json -"])
+    def test_a_full_device_is_one_sentence(self, verb: str) -> None:
+        said = shell(f"{verb} >/dev/full")
+        assert said.returncode == 1
+        assert said.stderr == "extrags: standard output cannot be written: No space left on device\n"
+        assert shell(f"{verb} >/dev/full 2>/dev/full").returncode == 1
+
+    @pytest.mark.parametrize("verb", ["run phantom/0@sparse", "cache gc", "report phantom/0@sparse"])
+    def test_without_a_home_folder_one_sentence_names_the_variable(self, verb: str, tmp_path: Path) -> None:
+        code = (
+            "import os, pwd, sys\n"
+            "del os.environ['HOME']\n"
+            "def unknown(*_): raise KeyError('uid not found')\n"
+            "pwd.getpwuid = unknown\n"
+            "from flows.cli import main\n"
+            "sys.exit(main())\n"
+        )
+        command = [sys.executable, "-c", code, *verb.split(), "--store", str(tmp_path)]
+        said = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert said.returncode == 2
+        assert (
+            said.stderr
+            == "extrags: no home folder is known of this user; set HOME to a folder that can be written\n"
+        )
+
+    @pytest.mark.parametrize("encoding", ["latin-1", "ascii"])
+    def test_any_encoding_will_do(self, encoding: str, tmp_path: Path) -> None:
+        said = shell(f'status --store "{tmp_path}"', {"PYTHONIOENCODING": encoding})
+        assert said.returncode == 0
+        assert "+ done   - skipped   x failed   . missing   > running" in said.stdout
+        (tmp_path / "€").mkdir()
+        said = shell(f'status --store "{tmp_path}/€"', {"PYTHONIOENCODING": encoding})
+        assert "0 artefacts in" in said.stdout
+        assert "/\\u20ac" in said.stdout
 
     def test_data_and_cache_load_no_torch_and_no_prefect(self, tmp_path: Path) -> None:
         code = (
@@ -97,6 +150,8 @@ class TestUsage:
         [
             (["phantom/0@spars"], "no setting 'spars'"),
             (["fantom/0@sparse"], "Did you mean phantom/0@sparse"),
+            (["~rec.mp4"], "no such file or folder: "),
+            (["@~list.txt"], "the manifest ~list.txt cannot be read"),
             ([SEQUENCE, "--set", "coarse.iteration=1"], "did you mean coarse.iterations"),
             ([SEQUENCE, "--set", "coarse.iterations=-1"], "coarse.iterations"),
             ([SEQUENCE, "--set", "coarse.iterations"], "expected NAME=VALUE"),
@@ -134,6 +189,25 @@ class TestUsage:
         assert "Traceback" not in said
         assert said.count("\n") == 1
         assert not (tmp_path / "store" / "artefacts").exists()
+
+    @pytest.mark.parametrize(
+        ("variable", "message"),
+        [
+            ("EXTRAGS_RUN_PAGE", "EXTRAGS_RUN_PAGE is 'maybe'; expected 0 or 1"),
+            ("EXTRAGS_VERIFY", "EXTRAGS_VERIFY is 'maybe'; expected all or metadata"),
+        ],
+    )
+    def test_wrong_values_in_the_environment(
+        self,
+        variable: str,
+        message: str,
+        tmp_path: Path,
+        monkeypatch: pytest.MonkeyPatch,
+        capsys: pytest.CaptureFixture[str],
+    ) -> None:
+        monkeypatch.setenv(variable, "maybe")
+        assert main(["run", SEQUENCE, "--store", str(tmp_path / "store")]) == 2
+        assert message in capsys.readouterr().err
 
     def test_debug_shows_where(self, tmp_path: Path) -> None:
         with pytest.raises(ConfigError):

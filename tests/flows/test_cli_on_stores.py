@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -138,6 +139,65 @@ class TestFinished:
         again = store.load_json(ROWS, ref)
         assert {row["stage"]: row["state"] for row in again} == {row["stage"]: row["state"] for row in rows}
         assert all(row["seconds"] == row["made_seconds"] for row in again if row["state"] == "ran")
+
+    @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(errno.ENOSPC, "No space left on device")])
+    def test_a_page_stays_where_making_it_again_does_not_end(
+        self,
+        error: BaseException,
+        finished: tuple[str, SequenceOutcome],
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> None:
+        import extrags.report.build
+
+        store, ref = Store(finished[0]), finished[1].refs["report"]
+        page = store.open(ref) / "report.html"
+        before = page.read_bytes()
+
+        def fail(*_: object) -> None:
+            raise error
+
+        with monkeypatch.context() as patched:
+            patched.setattr(extrags.report.build, "build_pages", fail)
+            if isinstance(error, KeyboardInterrupt):
+                with pytest.raises(KeyboardInterrupt):
+                    main(["report", SEQUENCE, *settled(store.root)])
+            else:
+                assert main(["report", SEQUENCE, *settled(store.root)]) == 1
+        assert store.find(store.manifest(ref).key) == ref
+        assert page.read_bytes() == before
+        # One that is finished takes its place, with other words too.
+        build = extrags.report.build.build_pages
+        monkeypatch.setattr(
+            extrags.report.build,
+            "build_pages",
+            lambda *given: (build(*given)[0] + "<!-- anew -->", build(*given)[1]),
+        )
+        assert main(["report", SEQUENCE, *settled(store.root)]) == 0
+        assert page.read_text().endswith("<!-- anew -->")
+        assert not list(store.backend.scratch.iterdir())
+
+    def test_a_report_of_a_store_that_cannot_be_written(
+        self,
+        finished: tuple[str, SequenceOutcome],
+        tmp_path: Path,
+        monkeypatch: pytest.MonkeyPatch,
+        capsys: pytest.CaptureFixture[str],
+    ) -> None:
+        from extrags.errors import StoreError
+        from extrags.store.directory import DirectoryBackend
+
+        def refuse(*_: object, **__: object) -> None:
+            raise StoreError("the store cannot be written: Read-only file system")
+
+        page = tmp_path / "page.html"
+        monkeypatch.setattr(DirectoryBackend, "check_writable", refuse)
+        monkeypatch.setattr("extrags.store.artefacts.private_directory", refuse)
+        assert main(["report", SEQUENCE, *settled(finished[0]), "-o", str(page)]) == 0
+        assert capsys.readouterr().out.strip() == str(page)
+        assert "</html>" in page.read_text()
+        assert "came from the cache" not in page.read_text()
+        assert main(["report", SEQUENCE, *settled(finished[0])]) == 1
+        assert "Read-only file system" in capsys.readouterr().err
 
     @pytest.mark.parametrize("scene", ["coarse", "final"])
     def test_export_writes_ply(

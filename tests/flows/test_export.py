@@ -262,6 +262,7 @@ class TestUsage:
             (["--exposure", "nan", "-o", "a.ply"], "--exposure is nan"),
             (["--to", "points", "--min-opacity", "1", "-o", "a.ply"], "--min-opacity is 1"),
             (["--to", "video", "--panels", "fine", "-o", "a.mp4"], "no panel 'fine'"),
+            (["--to", "video", "--panels", "final,coarse,final", "-o", "a.mp4"], "final is named twice"),
             (["--to", "video", "--fps", "0", "-o", "a.mp4"], "--fps is 0"),
             (["--to", "video", "--width", "3", "-o", "a.mp4"], "--width is 3"),
             (["--to", "video", "--between", "0", "-o", "a.mp4"], "--between is 0"),

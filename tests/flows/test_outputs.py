@@ -28,6 +28,7 @@ def test_a_home_is_expanded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         assert kind("x/y") == "x/y"
         with pytest.raises(ArgumentTypeError, match="~nobody-of-this-name/x cannot be written"):
             kind("~nobody-of-this-name/x")
+        assert kind("~nobody-of-this-name") == "~nobody-of-this-name"
     assert file_or_standard_output("-") == "-"
 
 

@@ -33,6 +33,7 @@ from flows.recorded_runs import (
     run_names,
 )
 from flows.runners import DirectRunner
+from flows.store_status import store_status
 from flows.wiring import run_sequence
 from tests.flows.tiny import SEQUENCE, tiny_config
 
@@ -173,6 +174,24 @@ def test_links_can_be_moved_with_the_folder_that_holds_page_and_store(store: Sto
     assert compared_run(store, run, "one", str(folder / "compared.html")).link in links
     inside = compared_run(store, run, "one", f"{store.root}/here#/x.html").link
     assert inside.startswith("../artefacts/")
+
+
+def test_pages_of_a_store_that_was_moved(store: Store, tmp_path: Path) -> None:
+    """Its records have the address of before."""
+    moved = Store(shutil.copytree(store.root, tmp_path / "elsewhere" / "store"))
+    links = [row.link for row in board_rows(moved) if row.status == "ok"]
+    assert len(links) == 2
+    assert all(link.startswith((tmp_path / "elsewhere").as_uri()) for link in links)
+    pages = [row.report for row in store_status(moved).rows if row.report is not None]
+    assert len(pages) == 2
+    assert all(Path(page).is_file() and moved.root in page for page in pages)
+
+
+def test_a_page_that_was_removed_is_linked_from_nowhere(store: Store, tmp_path: Path) -> None:
+    copy = Store(shutil.copytree(store.root, tmp_path / "store"))
+    copy.rm(chosen_runs(copy, [SEQUENCE])[0].report.key)
+    assert sorted(bool(row.link) for row in board_rows(copy) if row.status == "ok") == [False, True]
+    assert len([row.report for row in store_status(copy).rows if row.report is not None]) == 1
 
 
 def test_the_last_run_of_each_sequence(store: Store) -> None:

@@ -30,8 +30,9 @@ from flows.outcome import SequenceOutcome
 from flows.run_page import run_page
 from flows.sequence import reconstruct_sequence
 from tasks import run_page as senders
+from tasks.page_choice import PAGE_VARIABLE
 from tasks.run_log import RunLogHandler, run_log
-from tasks.run_page import PAGE_VARIABLE, artifact_key
+from tasks.run_page import artifact_key
 from tasks.stage import at, stage
 from tests.flows.tiny import SEQUENCE, TINY, tiny_config
 

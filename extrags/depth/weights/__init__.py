@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from extrags.array_files import load_safetensors
 from extrags.errors import WeightsError
+from extrags.user_paths import expanded
 
 if TYPE_CHECKING:
     # What computes is imported on first use: digests are asked for whenever an artefact is looked up.
@@ -46,7 +47,7 @@ def find_completion(setting: str) -> Path | None:
     if setting == NONE:
         return None
     bundled = setting == BUNDLED
-    file = Path(str(files(__name__))) / "completion.safetensors" if bundled else Path(setting).expanduser()
+    file = Path(str(files(__name__))) / "completion.safetensors" if bundled else expanded(setting)
     if not file.is_file() or file.suffix != ".safetensors":
         raise WeightsError(
             f"depth.completion={setting}: there is no .safetensors file {file}; {BUNDLED} takes those of "

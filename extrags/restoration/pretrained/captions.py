@@ -32,6 +32,7 @@ from extrags.errors import ConfigError, ExtragsError, SourceError, SourceNotFoun
 from extrags.events import MetricRecorded, emit
 from extrags.output_files import write_file
 from extrags.sequence import EndoscopicSequence
+from extrags.user_paths import expanded
 
 __all__ = ["CACHE_VARIABLE", "KEY_VARIABLE", "URL_VARIABLE", "Caption", "caption_of", "check_source"]
 
@@ -125,7 +126,7 @@ def check_source(config: CaptionConfig) -> Path | None:
         return None
     if config.file is None:
         raise ConfigError("enhance.caption.source=file needs enhance.caption.file")
-    file = Path(config.file).expanduser()
+    file = expanded(config.file)
     if not file.is_file():
         raise SourceNotFoundError("no such file; expected {name of the sequence: text}", file=file)
     return file
@@ -214,7 +215,7 @@ def _digest(url: str, question: dict[str, Any]) -> str:
 def _cache_folder() -> Path:
     given = os.environ.get(CACHE_VARIABLE)
     if given:
-        return Path(given).expanduser() / "captions"
+        return expanded(given) / "captions"
     return cache_directory() / "captions"
 
 

@@ -19,6 +19,7 @@ from extrags.errors import ConfigError, ExtragsError, MissingDependencyError, We
 from extrags.model_files import files_fingerprint
 from extrags.restoration.pretrained import checkpoint_driver
 from extrags.restoration.pretrained.captions import KEY_VARIABLE
+from extrags.user_paths import expanded
 
 __all__ = ["Clone", "check_clone", "check_interpreter", "clone_fingerprint", "guidance_scale", "run_clone"]
 
@@ -67,7 +68,7 @@ def check_clone(settings: CheckpointConfig) -> Clone:
                 f"enhance.backend=dynamicrafter needs enhance.checkpoint.{name}; set root (your clone of the "
                 "model's code), config (its YAML file) and checkpoint (its weights)"
             )
-    root = Path(str(settings.root)).expanduser().resolve()
+    root = expanded(str(settings.root)).resolve()
     if not root.is_dir():
         raise ConfigError(f"enhance.checkpoint.root={settings.root}: no such folder")
     for file in CLONE_FILES:
@@ -77,14 +78,14 @@ def check_clone(settings: CheckpointConfig) -> Clone:
                 "or of a fork (submodules not checked out?)"
             )
     # An absolute path stays what it is.
-    config = root / Path(str(settings.config)).expanduser()
+    config = root / expanded(str(settings.config))
     if not config.is_file():
         raise ConfigError(f"enhance.checkpoint.config={settings.config}: no file {config}")
     target = _target(config)
     module = root / (target.rsplit(".", 1)[0].replace(".", "/") + ".py")
     if not module.is_file():
         raise ConfigError(f"{config} names {target}, but the clone has no {module.relative_to(root)}")
-    checkpoint = Path(str(settings.checkpoint)).expanduser().resolve()
+    checkpoint = expanded(str(settings.checkpoint)).resolve()
     if not checkpoint.is_file() or not checkpoint.stat().st_size:
         raise WeightsError(
             f"enhance.checkpoint.checkpoint={settings.checkpoint}: no such file, or it is empty. extrags "

@@ -19,6 +19,7 @@ from extrags.config import PretrainedConfig
 from extrags.devices import chosen_device
 from extrags.errors import ConfigError, MissingDependencyError, WeightsError, installed_with
 from extrags.restoration.pretrained.parts import missing_part
+from extrags.user_paths import expanded
 
 __all__ = [
     "INSTALL",
@@ -116,7 +117,7 @@ def find_model(rule: PipelineRule, settings: PretrainedConfig) -> Path:
     """
     check_packages()
     model = settings.model or rule.usual_model
-    folder = Path(model).expanduser()
+    folder = expanded(model)
     if not folder.is_dir():
         folder = _from_hub(model, rule, settings)
     index = folder / INDEX

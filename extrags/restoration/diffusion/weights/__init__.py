@@ -13,6 +13,7 @@ from pathlib import Path
 
 from extrags.errors import WeightsError
 from extrags.restoration.description import DESCRIPTION
+from extrags.user_paths import expanded
 
 __all__ = ["BUNDLED", "NONE", "WEIGHTS", "files_digest", "find_weights", "weights_digest"]
 
@@ -42,7 +43,7 @@ def find_weights(setting: str) -> Path | None:
         weights = Path(str(files(__name__))) / WEIGHTS
         cure = f"this installation is incomplete: reinstall extrags, or set enhance.pretrained_weights={NONE}"
     else:
-        given = Path(setting).expanduser()
+        given = expanded(setting)
         weights = given / WEIGHTS if given.is_dir() else given
         cure = (
             "expected a .safetensors file with its .json beside it, or a folder that holds "
