@@ -283,7 +283,7 @@ def _reprojection_error(
     sequence: EndoscopicSequence,
     poses: Float[np.ndarray, "f 4 4"],
     pairs: list[tuple[int, int]],
-    seen: list[Float[np.ndarray, "n 3"]] | None = None,
+    seen: list[Float[np.ndarray, "_ 3"]] | None = None,
 ) -> float:
     """Relative difference of carried and found depth: median over a pair's points, mean over pairs.
 
@@ -304,7 +304,7 @@ def _pair_errors(
     sequence: EndoscopicSequence,
     poses: Float[np.ndarray, "f 4 4"],
     pairs: list[tuple[int, int]],
-    seen: list[Float[np.ndarray, "n 3"]] | None = None,
+    seen: list[Float[np.ndarray, "_ 3"]] | None = None,
 ) -> list[float | None]:
     """Of each pair the median, at most 1; None where too few points stay inside the image."""
     if sequence.depth_mm is None:
@@ -330,7 +330,7 @@ def _pair_errors(
 
 def _seen_points(
     sequence: EndoscopicSequence, pairs: list[tuple[int, int]]
-) -> list[Float[np.ndarray, "n 3"]]:
+) -> list[Float[np.ndarray, "_ 3"]]:
     """Points of known depth of each pair's first frame, in its camera: the same for all readings of poses."""
     assert sequence.depth_mm is not None
     found = []
