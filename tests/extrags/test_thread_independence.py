@@ -69,7 +69,14 @@ class Stages:
         with threads(1):
             self.enhancer = self._restorer(ENHANCE.model_copy(update={"judge": False}))
             self.pseudo_views = self._restored()
-            self.reference = {name: getattr(self, name)() for name in STAGES}
+        self._expected: dict[str, Arrays] = {}
+
+    def expected(self, stage: str) -> Arrays:
+        """What a stage makes on one thread."""
+        if stage not in self._expected:
+            with threads(1):
+                self._expected[stage] = getattr(self, stage)()
+        return self._expected[stage]
 
     def _restorer(self, config: EnhanceConfig) -> EmbeddedEnhancer:
         found = train_enhancer(self.tube.scene, self.tube.sequence, config, COARSE)
@@ -150,11 +157,11 @@ def stages() -> Stages:
 
 
 @pytest.mark.parametrize("count", [pytest.param(2, marks=pytest.mark.slow), 4])
-@pytest.mark.parametrize("stage", STAGES)
+@pytest.mark.parametrize("stage", [pytest.param(STAGES[0], marks=pytest.mark.slow), *STAGES[1:]])
 def test_same_bits_on_any_number_of_threads(stages: Stages, stage: str, count: int) -> None:
     with threads(count):
         found = getattr(stages, stage)()
-    expected = stages.reference[stage]
+    expected = stages.expected(stage)
     assert list(found) == list(expected)
     for name, value in expected.items():
         np.testing.assert_array_equal(found[name], value, err_msg=name)
