@@ -60,6 +60,7 @@ def sampled(plain: Callable[..., Any], decorator: Callable[[Any], Any]) -> Calla
         chosen = checked() if number < FIRST_CALLS or number % ONE_OF_CALLS == 0 else plain
         return chosen(*given, **named)
 
+    called.checked = checked  # type: ignore[attr-defined]
     return called
 
 

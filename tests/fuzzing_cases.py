@@ -191,15 +191,22 @@ def resealed(folder: Path) -> object:
     return EndoscopicSequence.load(folder / "artefacts" / "toy-v1-0" / EndoscopicSequence.stored_as)
 
 
-def lpips(folder: Path) -> Path:
+def lpips_arrays() -> dict[str, np.ndarray]:
     """Named as LPIPS's, far smaller."""
-    np.savez(folder / "w.npz", **{name: np.zeros(3, np.float32) for name in array_names("alex")})
+    shapes = {name: (3, 3, 1, 1) if name.endswith(".weight") else (3,) for name in array_names("alex")}
+    return {name: np.zeros(shape, np.float32) for name, shape in shapes.items()}
+
+
+def lpips(folder: Path) -> Path:
+    """As numpy saves them."""
+    np.savez(folder / "w.npz", **lpips_arrays())
     return folder / "w.npz"
 
 
 def state(folder: Path) -> Path:
     """What torch saves."""
-    torch.save({name: torch.zeros(3) for name in array_names("alex")}, folder / "w.pth")
+    arrays = {name: torch.from_numpy(value) for name, value in lpips_arrays().items()}
+    torch.save(arrays, folder / "w.pth")
     return folder / "w.pth"
 
 

@@ -93,13 +93,13 @@ def find_weights(explicit: str | None = None, net: LpipsNet = "alex") -> tuple[P
     if heads is not None and backbone.is_file():
         _check_digest(backbone)
         return (heads, backbone)
-    searched = " and no ".join(str(folder / filename) for folder in folders)
     parts = [
+        *(f"no {folder / filename}" for folder in folders),
         *([] if heads is not None else [f"no package with the heads ({installed_with('lpips')})"]),
         *([] if backbone.is_file() else [f"no {backbone} (extrags weights lpips --download)"]),
     ]
     raise WeightsError(
-        f"no LPIPS weights for {net}: there is no {searched}, {' and '.join(parts)}. Get what is missing, or "
+        f"no LPIPS weights for {net}: there is {' and '.join(parts)}. Get what is missing, or "
         "convert the published LPIPS v0.1 weights to npz (features.N.weight, features.N.bias, lin0, lin1, "
         "...) and put the file there, or name it, or the folder that holds it, in "
         f"{WEIGHTS_VARIABLE} or evaluate.lpips_weights"
