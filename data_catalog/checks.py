@@ -310,8 +310,9 @@ def _pair_errors(
     if sequence.depth_mm is None:
         return []
     cameras = sequence.cameras
+    seen = _seen_points(sequence, pairs) if seen is None else seen
     errors: list[float | None] = []
-    for (first, second), points in zip(pairs, seen or _seen_points(sequence, pairs), strict=True):
+    for (first, second), points in zip(pairs, seen, strict=True):
         relative = invert_poses(poses[second][None])[0] @ poses[first]
         carried = transform_points(relative, points)
         pixels = project_points(carried, sequence.K[second], sequence.lens)

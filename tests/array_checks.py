@@ -50,6 +50,9 @@ def sampled(plain: Callable[..., Any], decorator: Callable[[Any], Any]) -> Calla
     Args:
         plain: as it is written.
         decorator: makes the checked one, when it is first called: most functions are not called by a test.
+
+    Returns:
+        It has an entry `checked` among its attributes: what gives the function that checks each call.
     """
     calls = itertools.count()
     checked = functools.cache(lambda: decorator(plain))
@@ -60,7 +63,7 @@ def sampled(plain: Callable[..., Any], decorator: Callable[[Any], Any]) -> Calla
         chosen = checked() if number < FIRST_CALLS or number % ONE_OF_CALLS == 0 else plain
         return chosen(*given, **named)
 
-    called.checked = checked  # type: ignore[attr-defined]
+    vars(called)["checked"] = checked
     return called
 
 

@@ -31,7 +31,7 @@ def test_arrays_are_found_by_their_types_and_by_other_names_of_these() -> None:
 
 def test_a_wrong_shape_is_refused() -> None:
     # As in its first calls, of which other tests may have made all.
-    checked = rotation_about.checked()  # type: ignore[attr-defined]
+    checked = vars(rotation_about)["checked"]()
     with pytest.raises(TypeCheckError, match="axis"):
         checked(np.zeros(4), 0.1)
 

@@ -15,9 +15,13 @@ import json
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
+
+if TYPE_CHECKING:
+    from extrags.restoration.diffusion.network import RestorationNetwork
 
 FIRST_UNSEEN = 1000
 DIGITS = 4
@@ -35,7 +39,6 @@ def main() -> None:
     parser.add_argument("--score", nargs="*", default=[], metavar="SEQUENCE")
     parser.add_argument("--write", action="store_true")
     given = parser.parse_args()
-    from extrags.restoration.diffusion.embedded import EARLIER_FORMATS, FORMAT
     from extrags.restoration.diffusion.weights import BUNDLED, find_weights
     from extrags.restoration.uncertainty.domain import Domain
 
@@ -55,9 +58,8 @@ def main() -> None:
     file = weights.with_suffix(".json")
     description = json.loads(file.read_text())
     rounded = {name: _rounded(value) for name, value in domain.as_dict().items()}
-    earlier = EARLIER_FORMATS.get(description["format"], {})
     place = "the domain's numbers"
-    text = json.dumps({**earlier, **description, "format": FORMAT, "domain": place}, indent=2)
+    text = json.dumps({**description, "domain": place}, indent=2)
     # In one line: there are thousands.
     file.write_text(text.replace(json.dumps(place), json.dumps(rounded)) + "\n")
     print(f"written: {Path(file).name}")
@@ -83,7 +85,7 @@ def features_of_sequence(name: str) -> Float[np.ndarray, "n c"]:
     return sequence_features(_network(), small)
 
 
-def _network():  # type: ignore[no-untyped-def]
+def _network() -> RestorationNetwork:
     from extrags.config import profile_config
     from extrags.restoration.diffusion.embedded import pretrained
 

@@ -50,12 +50,12 @@ FORMAT = 5
 """Raised when a saved restorer cannot be read by newer code."""
 _UNKNOWN_DOMAIN: dict[str, Any] = {"domain": None, "domain_score": None, "scene_calibrated": False}
 EARLIER_FORMATS: dict[int, dict[str, Any]] = {
-    2: {"generative": False, "drawing": False, "depth_from_image": None, **_UNKNOWN_DOMAIN},
-    3: {"depth_from_image": None, **_UNKNOWN_DOMAIN},
-    4: _UNKNOWN_DOMAIN,
+    2: {"generative": False, "drawing": False, "depth_from_image": None},
+    3: {"depth_from_image": None},
+    4: {},
 }
-"""What stands for what earlier formats that can be read lack, or have of another kind: the domain, of other
-features."""
+"""What earlier formats that can be read lack, and what stands for it; their domain, of other features, is not
+read."""
 PATCHES = "patches.safetensors"
 UNTRAINED = "untrained"
 """Folder inside that of a restorer."""
