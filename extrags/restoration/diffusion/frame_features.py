@@ -13,9 +13,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from extrags.restoration.diffusion.network import SIZE_MULTIPLE, RestorationNetwork
+from extrags.restoration.training_data.photographs import photograph_layers
 from extrags.sequence import EndoscopicSequence
 from extrags.threads import one_torch_thread
-from extrags.view_synthesis.conditioning import Layers, condition
+from extrags.view_synthesis.conditioning import condition
 from extrags.view_synthesis.references import LightTransfer
 
 __all__ = ["frame_features", "sequence_features"]
@@ -91,22 +92,6 @@ def _known_view(
     network: RestorationNetwork, rgb: Float[Tensor, "1 3 h w"], tissue: Float[Tensor, "1 1 h w"]
 ) -> Float[Tensor, "1 c h w"]:
     """Channels of a view that is rendered as it was photographed, at one distance."""
-    nothing, everywhere = torch.zeros_like(tissue), torch.ones_like(tissue)
-    colors = rgb * tissue
-    layers = Layers.of(
-        rendered=colors,
-        alpha=tissue,
-        depth_mm=tissue,
-        spread=nothing,
-        uncertainty=1 - tissue,
-        nearest=colors,
-        nearest_weight=tissue,
-        blend=colors,
-        blend_weight=tissue,
-        log_ratio=nothing,
-        ray_length=everywhere,
-        invented=torch.zeros_like(colors),
-        invented_weight=nothing,
-    )
+    layers = photograph_layers(rgb, tissue, depth_mm=1.0)
     # At the distance where the fall-off is one.
     return condition(layers, LightTransfer(None, 1.0, 1.0), folded=network.folded).channels

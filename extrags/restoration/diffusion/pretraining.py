@@ -84,6 +84,15 @@ class PretrainingConfig(StageConfig):
         1.0, ge=0, description="pull of the adversary at invented colours, relative to all else in these"
     )
     adversary_rate: float = Field(4e-4, gt=0, description="learning rate of the adversary")
+    color_variety: float = Field(
+        0.0, ge=0, le=1, description="how far hue, saturation and contrast of crops are varied"
+    )
+    photograph_share: float = Field(
+        0.0,
+        ge=0,
+        lt=1,
+        description="share of the crops that are frames of the recording, blurred in parts and with holes",
+    )
     patches: int = Field(6, ge=1, description="patches of the scene's frames beside each crop")
     patch_px: int = Field(64, ge=32, multiple_of=8, description="side of a patch")
     device: Literal["auto", "cpu", "cuda"] = Field(
@@ -299,6 +308,7 @@ def _sampler(file: Path, config: PretrainingConfig, number: int, iteration: int)
         weight=scene.pairs.weight.half(),
         depth_mm=scene.pairs.depth_mm.half(),
     )
+    shows_frames = config.generative or config.photograph_share > 0
     return CropSampler(
         pairs,
         scene.transfer,
@@ -307,9 +317,11 @@ def _sampler(file: Path, config: PretrainingConfig, number: int, iteration: int)
         side_multiple=SIZE_MULTIPLE,
         # A training that goes on must not see the same crops again.
         seed=config.seed * 100_003 + number + 1_000_003 * iteration,
-        frames=(scene.references.images, scene.references.valid) if config.generative else None,
-        patches=(config.patches, config.patch_px),
+        frames=(scene.references.images, scene.references.valid) if shows_frames else None,
+        patches=(config.patches if config.generative else 0, config.patch_px),
         folded=not config.generative,
+        color_variety=config.color_variety,
+        photograph_share=config.photograph_share,
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,6 +13,8 @@ from torch import Tensor
 
 from extrags.errors import ConfigError
 from extrags.restoration.training_data.pairs import Pairs
+from extrags.restoration.training_data.photographs import degraded_photograph
+from extrags.restoration.training_data.recoloring import Recoloring
 from extrags.view_synthesis.conditioning import Conditioning, Layers, condition
 from extrags.view_synthesis.references import LightTransfer
 
@@ -34,11 +37,6 @@ REFERENCE_DROPOUT = 0.35
 """Probability that all real views are removed."""
 INVENTED_KEPT = 0.5
 """Probability that a hole which is cut leaves what keyframes have invented there."""
-EXPOSURE_JITTER = 0.3
-COLOR_JITTER = 0.1
-"""Standard deviations of the logarithm of a common and a per-channel gain. They are large because virtual
-views are nearer to the wall than real ones: the restorer has to keep the colour of its input, not the mean
-of the scene."""
 SMALLEST_CROP_PX = 32
 PATCH_SIDE_MULTIPLE = 8
 """Sides of patches are multiples of this, which the network's patch encoder needs."""
@@ -107,10 +105,12 @@ class CropSampler:
         crop_px: side of a crop; images smaller than that give smaller crops.
         side_multiple: of which a crop's side must be a multiple; the network's.
         seed: of all random draws.
-        frames: real frames of the scene that patches are taken from, in [0, 1], [F, 3, H, W], and which of
-            their pixels show tissue, [F, H, W]; None without.
+        frames: real frames of the scene that patches and photographs are taken from, in [0, 1],
+            [F, 3, H, W], and which of their pixels show tissue, [F, H, W]; None without.
         patches: how many of them per crop, and the side of each in pixels.
         folded: what was invented appears as a blend of real views would, as `condition`.
+        color_variety: how far hue, saturation and contrast are varied, as `Recoloring.drawn`.
+        photograph_share: of the crops that are a frame of the scene, known but for what is cut or blurred.
 
     Raises:
         ConfigError: when the images are too small for any crop, or no pair is left to train on.
@@ -128,8 +128,12 @@ class CropSampler:
         frames: tuple[Float[Tensor, "f 3 h w"], Bool[Tensor, "f h w"]] | None = None,
         patches: tuple[int, int] = (0, 0),
         folded: bool = True,
+        color_variety: float = 0.0,
+        photograph_share: float = 0.0,
     ) -> None:
         self._folded = folded
+        self._color_variety = color_variety
+        self._photograph_share = photograph_share if frames is not None else 0.0
         self._frames = frames
         self._patches = patches
         self._pairs = pairs.subset(np.flatnonzero(~pairs.validation))
@@ -157,11 +161,11 @@ class CropSampler:
         """The next batch."""
         crops, patches = [], []
         for _ in range(self._batch):
-            gain = self._gain()
-            crops.append(self._crop(self._next(), gain))
-            if self._frames is not None:
+            recoloring = Recoloring.drawn(self._generator, self._color_variety)
+            crops.append(self._crop(recoloring))
+            if self._frames is not None and self._patches[0] > 0:
                 cut = random_patches(*self._frames, *self._patches, self._generator)
-                patches.append((cut * gain).clamp(0, 1))
+                patches.append(recoloring.applied(cut))
         data, clean, weight, depth = (torch.cat(part) for part in zip(*crops, strict=True))
         layers = Layers(data)
         return Batch(
@@ -178,18 +182,14 @@ class CropSampler:
             self._order = self._generator.permutation(len(self._pairs)).tolist()
         return self._order.pop()
 
-    def _crop(self, index: int, gain: Float[Tensor, "1 3 1 1"]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def _crop(self, recoloring: Recoloring) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         generator, pairs = self._generator, self._pairs
-        top, left = self._corner()
-        window = (..., slice(top, top + self._side), slice(left, left + self._side))
-        # Many scenes are kept in half precision; crops are not. The copy is changed below.
-        layers = Layers(pairs.layers.data[index : index + 1][window].clone().float())
-        clean, weight, depth = (
-            part[index : index + 1][window].float() for part in (pairs.target, pairs.weight, pairs.depth_mm)
-        )
+        # Drawn only where there may be some: other trainings see the draws they always saw.
+        photograph = self._photograph_share > 0 and generator.random() < self._photograph_share
+        layers, clean, weight, depth = self._photograph() if photograph else self._pair(self._next())
         for name in ("rendered", "nearest", "blend", "invented"):
-            layers.get(name).mul_(gain).clamp_(0, 1)
-        clean = (clean * gain).clamp(0, 1)
+            layers.get(name).copy_(recoloring.applied(layers.get(name)))
+        clean = recoloring.applied(clean)
         if generator.random() < PASTED_HOLES:
             other = int(generator.integers(len(pairs)))
             row, column = self._corner()
@@ -213,6 +213,36 @@ class CropSampler:
         data, clean, weight, depth = everything.split((layers.data.shape[1], 3, 1, 1), dim=1)
         return data, clean, weight, depth
 
+    def _pair(self, index: int) -> tuple[Layers, Tensor, Tensor, Tensor]:
+        """A window of a pair: layers that may be changed, truth, weight and depth."""
+        pairs, window = self._pairs, self._window()
+        # Many scenes are kept in half precision; crops are not.
+        layers = Layers(pairs.layers.data[index : index + 1][window].clone().float())
+        clean, weight, depth = (
+            part[index : index + 1][window].float() for part in (pairs.target, pairs.weight, pairs.depth_mm)
+        )
+        return layers, clean, weight, depth
+
+    def _photograph(self) -> tuple[Layers, Tensor, Tensor, Tensor]:
+        """A window of a frame of the scene; its depth is not known."""
+        assert self._frames is not None
+        images, valid = self._frames
+        frame, window = int(self._generator.integers(len(images))), self._window()
+        rgb = images[frame : frame + 1][window].float()
+        tissue = valid[frame : frame + 1, None][window].float()
+        layers = degraded_photograph(
+            rgb,
+            tissue,
+            self._half_plane(),
+            depth_mm=self._transfer.scale_mm,
+            generator=self._generator,
+        )
+        return layers, rgb * tissue, tissue, torch.zeros_like(tissue)
+
+    def _window(self) -> tuple[Any, ...]:
+        top, left = self._corner()
+        return (..., slice(top, top + self._side), slice(left, left + self._side))
+
     def _keeps_invented(self, layers: Layers) -> bool:
         """Drawn only where there is something to keep: other pairs see the draws they always saw."""
         if not bool((layers.get("invented_weight") > 0).any()):
@@ -225,12 +255,6 @@ class CropSampler:
             int(self._generator.integers(height - self._side + 1)),
             int(self._generator.integers(width - self._side + 1)),
         )
-
-    def _gain(self) -> Float[Tensor, "1 3 1 1"]:
-        """Another exposure and another white balance."""
-        exposure = self._generator.normal(0, EXPOSURE_JITTER)
-        gains = np.exp(exposure + self._generator.normal(0, COLOR_JITTER, 3)).astype(np.float32)
-        return torch.from_numpy(gains)[None, :, None, None]
 
     def _half_plane(self) -> Float[Tensor, "1 1 h w"]:
         angle = self._generator.uniform(0, 2 * math.pi)
