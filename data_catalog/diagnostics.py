@@ -17,11 +17,11 @@ from jaxtyping import Float
 
 from data_catalog.checks import USUAL_MISTAKES, depth_disagreement, other_readings
 from data_catalog.findings import Finding, warning
-from data_catalog.frame_names import NameOrder, is_gap, usual_step
 from data_catalog.mask_findings import mask_findings
 from data_catalog.matches import match_neighbours, pose_support
 from data_catalog.plausible_intrinsics import unlikely
 from extrags.cameras import Cameras, rotation_angle_deg
+from extrags.frame_names import NameOrder, is_gap, usual_step
 from extrags.frame_quantiles import median_of_frames
 from extrags.sequence import EndoscopicSequence, saturated_mask
 

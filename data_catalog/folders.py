@@ -17,7 +17,6 @@ from data_catalog.calibration_files import with_calibration_file
 from data_catalog.dataset import Descriptor, Source
 from data_catalog.folder_reader import FolderReader, Glance
 from data_catalog.footage import DICOM_SUFFIXES, VIDEO_SUFFIXES, files_of_kind
-from data_catalog.frame_names import COLOR_SUFFIXES, natural_key
 from data_catalog.images import image_entries
 from data_catalog.named_folders import find_folder, not_on_this_machine
 from data_catalog.posed_frames import SourceFrames
@@ -35,6 +34,7 @@ from data_catalog.readers import (
 )
 from extrags.config import IngestConfig
 from extrags.errors import ConfigError, SourceError, SourceNotFoundError
+from extrags.frame_names import COLOR_SUFFIXES, natural_key
 from extrags.sequence import EndoscopicSequence
 from extrags.user_paths import expanded
 

@@ -11,7 +11,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import UInt8
 
-from data_catalog.frame_names import natural_key
+from extrags.frame_names import natural_key
 
 __all__ = ["DICOM_SUFFIXES", "VIDEO_SUFFIXES", "Footage", "FootageFrame", "TimeSpan", "files_of_kind"]
 

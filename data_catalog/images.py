@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from data_catalog.frame_names import COLOR_SUFFIXES, NameOrder
 from data_catalog.inside import inside
 from extrags.array_files import load_npy
 from extrags.errors import SourceError, SourceNotFoundError
 from extrags.events import Progress, emit
+from extrags.frame_names import COLOR_SUFFIXES, NameOrder
 from extrags.sequence import EndoscopicSequence
 
 __all__ = [

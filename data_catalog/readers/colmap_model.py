@@ -34,13 +34,6 @@ from jaxtyping import Float, UInt8
 
 from data_catalog.calibration_files import LENS_OF_POSES
 from data_catalog.folder_reader import FolderReader
-from data_catalog.frame_names import (
-    COLOR_SUFFIXES,
-    NameOrder,
-    natural_key,
-    order_for_fingerprint,
-    tell_about_order,
-)
 from data_catalog.images import save_images
 from data_catalog.inside import inside
 from data_catalog.posed_frames import PosedFrame, SourceFrames
@@ -56,6 +49,13 @@ from data_catalog.readers.frame_list import FilesBeside, listed_split, present_f
 from extrags.cameras import pixel_rays
 from extrags.config import IngestConfig
 from extrags.errors import SourceError, SourceNotFoundError
+from extrags.frame_names import (
+    COLOR_SUFFIXES,
+    NameOrder,
+    natural_key,
+    order_for_fingerprint,
+    tell_about_order,
+)
 from extrags.lens import Lens
 from extrags.sequence import EndoscopicSequence
 

@@ -38,12 +38,12 @@ from jaxtyping import Bool, Float, UInt8
 
 from data_catalog.calibration_files import LENS_OF_POSES
 from data_catalog.folder_reader import FolderReader
-from data_catalog.frame_names import NameOrder, order_for_fingerprint, tell_about_order
 from data_catalog.images import color_files, read_color, read_mask, spread
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from extrags.array_files import load_npy
 from extrags.config import IngestConfig
 from extrags.errors import PoseError, SourceError, SourceNotFoundError
+from extrags.frame_names import NameOrder, order_for_fingerprint, tell_about_order
 from extrags.lens import Lens
 
 __all__ = ["POSES_FILE", "READER", "MaskPolarity", "mask_polarity", "polarity_of_images", "read_llff"]

@@ -11,8 +11,8 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from data_catalog.frame_names import natural_key
 from extrags.errors import SourceError, SourceNotFoundError
+from extrags.frame_names import natural_key
 
 __all__ = [
     "FilesBeside",

@@ -1,7 +1,7 @@
 """Reader of plain frames: a folder of images and nothing else; the poses stage finds the rest.
 
 Images lie in the folder itself, or in `images/` or `rgb/` below it, and are taken in the order of the
-numbers in their names: 9 before 10, decimals by their values (`data_catalog.frame_names`). Where several of
+numbers in their names: 9 before 10, decimals by their values (`extrags.frame_names`). Where several of
 these hold images, those of the one with at least twice as many as any other are taken, and the others named
 in a warning; without such a one the source is refused. Woven (interlaced) images are read as they are, with
 a warning. Of a stereo endoscope the frames of one camera are read (`data_catalog.readers.stereo_frames`).
@@ -31,7 +31,6 @@ from data_catalog.checks import check_intrinsics
 from data_catalog.content import content_mask, looked_at
 from data_catalog.folder_reader import FolderReader
 from data_catalog.footage import DICOM_SUFFIXES, VIDEO_SUFFIXES, files_of_kind
-from data_catalog.frame_names import NameOrder, order_for_fingerprint, tell_about_order
 from data_catalog.guessed_intrinsics import ASSUMED_FIELD_OF_VIEW_DEG, intrinsics_of_field_of_view
 from data_catalog.images import (
     check_links,
@@ -61,6 +60,7 @@ from data_catalog.sampling import Sampling
 from data_catalog.stereo import BothViews
 from extrags.config import IngestConfig
 from extrags.errors import SourceError, SourceNotFoundError
+from extrags.frame_names import NameOrder, order_for_fingerprint, tell_about_order
 from extrags.lens import Lens
 from extrags.provenance import StereoCamera
 

@@ -24,7 +24,6 @@ from jaxtyping import Float
 
 from data_catalog.dataset import Descriptor
 from data_catalog.folder_reader import FolderReader
-from data_catalog.frame_names import natural_key
 from data_catalog.images import image_size, read_depth
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from data_catalog.rotations import quaternion_rotation
@@ -32,6 +31,7 @@ from data_catalog.sampling import LensSampling
 from extrags.cameras import compose
 from extrags.config import IngestConfig
 from extrags.errors import PoseError, SourceError, SourceNotFoundError
+from extrags.frame_names import natural_key
 from extrags.lens import Lens
 from extrags.observed_surface import observed_by_depth
 

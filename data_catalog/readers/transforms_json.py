@@ -33,7 +33,6 @@ from jaxtyping import Float, UInt8
 
 from data_catalog.calibration_files import LENS_OF_POSES
 from data_catalog.folder_reader import FolderReader
-from data_catalog.frame_names import NameOrder, natural_key, order_for_fingerprint, tell_about_order
 from data_catalog.images import (
     COLOR_SUFFIXES,
     image_entries,
@@ -49,6 +48,7 @@ from data_catalog.readers.unknown_keys import warn_of_unknown_keys
 from extrags.array_files import load_ply_vertices
 from extrags.config import IngestConfig
 from extrags.errors import PoseError, SourceError, SourceNotFoundError
+from extrags.frame_names import NameOrder, natural_key, order_for_fingerprint, tell_about_order
 from extrags.sequence import EndoscopicSequence
 
 __all__ = ["READER", "TRANSFORMS_FILE", "write_transforms"]

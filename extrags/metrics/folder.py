@@ -10,7 +10,6 @@ name. Files and folders whose names begin with a dot are none of them.
 from __future__ import annotations
 
 import math
-import re
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
@@ -20,6 +19,7 @@ from jaxtyping import Float
 
 from extrags.array_files import load_npy
 from extrags.errors import ConfigError, NonFiniteError, ShapeError, SourceError, SourceNotFoundError
+from extrags.frame_names import NameOrder, tell_about_order
 from extrags.metrics.protocol import RenderedViews
 from extrags.sequence import EndoscopicSequence
 
@@ -119,18 +119,19 @@ def _by_number(
             f"not those of the frames ({_some(wanted)})",
             file=folder,
         )
-    numbers = [re.findall(r"\d+", file.stem) for file in files]
-    bare = [file.name for file, found in zip(files, numbers, strict=True) if not found]
+    order = NameOrder(file.stem for file in files)
+    keys = [order.numbers(file.stem) for file in files]
+    bare = [file.name for file, found in zip(files, keys, strict=True) if not found]
     if bare:
         raise SourceError(
             f"{kind}s without a number in their names have no place: {_some(bare)}; name them after their "
             f"frames ({_some(wanted)})",
             file=folder,
         )
-    keys = [tuple(int(number) for number in found) for found in numbers]
     if len(set(keys)) != len(keys):
         twice = [file.name for file, key in zip(files, keys, strict=True) if keys.count(key) > 1]
         raise SourceError(f"{kind}s with the same number: {_some(twice)}", file=folder)
+    tell_about_order(folder, order)
     return [file for _, file in sorted(zip(keys, files, strict=True))]
 
 

@@ -129,6 +129,20 @@ def test_else_numbers_decide_and_nine_comes_before_ten(sequence: EndoscopicSeque
     np.testing.assert_array_equal(np.rint(read_renders(folder, sequence).rgb * 255), LEVELS[TEST])
 
 
+def test_decimal_numbers_go_by_their_value(sequence: EndoscopicSequence, tmp_path: Path) -> None:
+    """Times in seconds, as a renderer names its views by."""
+    folder = write(tmp_path / "renders", {"0.05.png": LEVELS[3], "0.1.png": LEVELS[1], "0.15.png": LEVELS[4]})
+    np.testing.assert_array_equal(np.rint(read_renders(folder, sequence).rgb * 255), LEVELS[TEST])
+
+
+def test_where_the_order_of_numbers_is_open_it_is_told(
+    sequence: EndoscopicSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = write(tmp_path / "renders", {"1.9.png": LEVELS[3], "1.11.png": LEVELS[1], "1.12.png": LEVELS[4]})
+    np.testing.assert_array_equal(np.rint(read_renders(folder, sequence).rgb * 255), LEVELS[TEST])
+    assert "1.9 is read before 1.11" in caplog.text
+
+
 def test_the_same_figures_as_our_own_renders(sequence: EndoscopicSequence, tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     rgb = (LEVELS[TEST] / 255 + rng.normal(0, 0.1, (3, HEIGHT, WIDTH, 3))).astype(np.float32)

@@ -5,11 +5,12 @@ from __future__ import annotations
 import logging
 import random
 from collections.abc import Callable
+from decimal import Decimal
 from pathlib import Path
 
 import pytest
 
-from data_catalog.frame_names import NameOrder, file_key, natural_key, order_for_fingerprint, tell_about_order
+from extrags.frame_names import NameOrder, file_key, natural_key, order_for_fingerprint, tell_about_order
 
 
 def test_natural_order() -> None:
@@ -127,3 +128,10 @@ def test_numbers_of_frames(names: list[str], numbers: list[str]) -> None:
     order = NameOrder(names)
     assert [str(order.number(name)) for name in names[:3]] == numbers
     assert NameOrder(["a"]).number("a") is None
+
+
+def test_all_numbers_of_a_name() -> None:
+    order = NameOrder(["cut2_0.05.png", "cut2_0.1.png", "cut2_0.15.png", "v1.2.3_9.png"])
+    assert order.numbers("cut2_0.05.png") == (2, Decimal("0.05"))
+    assert order.numbers("v1.2.3_9.png") == (1, 2, 3, 9)
+    assert order.numbers("none.png") == ()

@@ -173,6 +173,15 @@ class NameOrder:
             return Decimal(last)
         return Decimal(int(last.rpartition(".")[2]))
 
+    def numbers(self, name: str) -> tuple[Decimal, ...]:
+        """All numbers of a name: a decimal is one of them, counts that are joined by points are several."""
+        item = _Parted.of(name)
+        decimals = self._decimal.get(item.pattern, frozenset())
+        parts = [
+            [number] if place in decimals else number.split(".") for place, number in enumerate(item.numbers)
+        ]
+        return tuple(Decimal(part) for number in parts for part in number)
+
     def _decide(self, pattern: _Pattern, members: dict[str, _Parted]) -> None:
         decimal: set[int] = set()
         undecided: set[int] = set()
