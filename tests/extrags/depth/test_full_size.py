@@ -45,7 +45,7 @@ def test_without_shading_light_tells_the_network_nothing(
         return inputs(frames, stereo)
 
     monkeypatch.setattr(estimate, "completion_inputs", looked_at)
-    sequence = with_points(withheld_phantom(5)).training_part()
+    sequence = with_points(withheld_phantom(5, width=64, height=48)).training_part()
     estimate.estimate_depth(sequence, DepthConfig(hypotheses=24, sources=3, shading=shading))
     assert shown
     assert all(bool(torch.isfinite(scatter).all()) == shading for scatter in shown)

@@ -15,7 +15,7 @@ from tests.benchmarks.bench_freespace import Truth, measured
 from tests.colon_ct import FOLDER, ColonCT
 
 
-@pytest.mark.parametrize("begin_mm", [20.0, 1200.0])
+@pytest.mark.parametrize("begin_mm", [20.0, pytest.param(1200.0, marks=pytest.mark.slow)])
 def test_free_space_lies_inside_and_poses_have_the_room_they_are_said_to_have(
     shared_data: Path, begin_mm: float
 ) -> None:
