@@ -31,7 +31,7 @@ def check_names(sequences: list[str]) -> None:
             resolve(sequence)
         except UnknownSequenceError:
             raise
-        except ExtragsError:
+        except (ExtragsError, OSError):
             continue
 
 
@@ -53,7 +53,7 @@ def check_working_distance(cases: Sequence[SequenceCase]) -> None:
         given.add(case.sequence)
         try:
             about = glance(case.sequence, config.ingest) or describe(case.sequence)
-        except (ConfigError, SourceError, UnknownSequenceError):
+        except (ConfigError, SourceError, UnknownSequenceError, OSError):
             # What is wrong with a source is said by the run, for each by itself.
             continue
         if about.has_poses:
