@@ -6,9 +6,10 @@ import datetime
 import json
 import logging
 import shutil
+import stat
 import time
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -355,6 +356,7 @@ class Store:
                 slot.path.mkdir()
                 with self._blaming(slot._inputs.values()):
                     yield slot
+                _share(slot.path, like=scratch / ABOUT)
                 listing = list_contents(slot.path, slot.run_files)
                 slot._manifest = self.backend.commit(
                     slot.path,
@@ -478,6 +480,25 @@ class Store:
             if not dry_run:
                 shutil.rmtree(failures)
         return removed + self.backend.remove_damaged(dry_run=dry_run)
+
+
+def _share(directory: Path, *, like: Path) -> None:
+    """Give the files of an artefact at least the permissions that a new file has here.
+
+    Some writers make files that their owner alone may read, whatever the umask says: other users of the store
+    could not use them.
+
+    Args:
+        directory: the files.
+        like: a file that was written in the usual way.
+    """
+    usual = stat.S_IMODE(like.stat().st_mode)
+    for path in directory.rglob("*"):
+        mode = path.lstat().st_mode
+        if stat.S_ISREG(mode) and usual & ~mode:
+            # Where a file system has no permissions, nobody is refused.
+            with suppress(OSError):
+                path.chmod(stat.S_IMODE(mode) | usual)
 
 
 def _matches(pattern: str, *names: str) -> bool:

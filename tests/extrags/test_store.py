@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import stat
 import subprocess
 import sys
 import uuid
@@ -291,6 +292,24 @@ class TestDirectory:
         ref = put(store)
         (store.open(ref) / "deep" / "file.txt").write_text("jello")
         assert not store.verify(ref)
+
+    def test_files_are_as_open_as_the_umask_says(self, tmp_path: Path) -> None:
+        store, before = Store(tmp_path), os.umask(0o002)
+        try:
+            with store.slot(stage="s", version=1, key="s-v1-a") as slot:
+                (slot.path / "usual").write_bytes(b"x")
+                (slot.path / "folder").mkdir()
+                private = slot.path / "folder" / "private"
+                # As writers do that make a temporary file first.
+                os.close(os.open(private, os.O_WRONLY | os.O_CREAT, 0o600))
+            with store.slot(stage="s", version=1, key="s-v1-b") as slot:
+                (slot.path / "program").write_bytes(b"x")
+                (slot.path / "program").chmod(0o755)
+        finally:
+            os.umask(before)
+        files = [path for path in (tmp_path / "artefacts").rglob("*") if path.is_file()]
+        modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in files}
+        assert modes == {"usual": 0o664, "private": 0o664, "program": 0o775, "manifest.json": 0o664}
 
     def test_a_store_that_cannot_be_written_says_so(self, tmp_path: Path) -> None:
         (tmp_path / "file").write_text("x")
