@@ -166,7 +166,9 @@ class DirectoryBackend:
 
     def write_record(self, name: str, text: bytes) -> None:
         """Write `records/<name>`; one that is there is replaced at once, never half."""
-        self._put(self.root / RECORDS / name, text)
+        target = self.root / RECORDS / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        self._put(target, text)
 
     def read_records(self, prefix: str) -> dict[str, bytes]:
         """Records by name, of those whose name begins so."""
@@ -188,7 +190,6 @@ class DirectoryBackend:
         (self.root / RECORDS / name).unlink(missing_ok=True)
 
     def _put(self, target: Path, text: bytes) -> None:
-        target.parent.mkdir(parents=True, exist_ok=True)
         with private_directory(self.scratch, target.name) as private:
             (private / "written").write_bytes(text)
             (private / "written").replace(target)
@@ -223,7 +224,10 @@ class DirectoryBackend:
                 if present is not None and same_content(present, manifest):
                     if not renew:
                         return present
-                    self._put(target / MANIFEST, manifest_text(manifest))
+                    try:
+                        self._put(target / MANIFEST, manifest_text(manifest))
+                    except FileNotFoundError:
+                        continue  # Removed meanwhile: then this one takes its place.
                     return manifest
                 if not target.exists():
                     raise

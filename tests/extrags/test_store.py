@@ -18,9 +18,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import BaseModel
 
+import extrags.store.directory
 from extrags.config import CoarseConfig, IngestConfig
 from extrags.errors import ConfigError, DamagedArtefactError, MissingDependencyError, StoreError
-from extrags.store import MANIFEST, Ref, Store, canonical, content_digest, digest_of
+from extrags.store import MANIFEST, Manifest, Ref, Store, canonical, content_digest, digest_of
+from extrags.store.integrity import Examinable
 
 plain = st.recursive(
     st.none()
@@ -340,6 +342,24 @@ class TestDirectory:
             assert removed[0].startswith("scratch/toy-v1-aa.")
         assert [manifest.key for manifest in store.ls()] == ["toy-v1-bb"]
         assert list((tmp_path / "scratch").iterdir()) == []
+
+    def test_what_is_removed_while_it_is_made_anew_is_there_whole(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        store = Store(tmp_path)
+        put(store)
+        looked = extrags.store.directory.intact_manifest
+
+        def then_removed(backend: Examinable, key: str) -> Manifest | None:
+            found = looked(backend, key)
+            store.rm(key)
+            return found
+
+        monkeypatch.setattr(extrags.store.directory, "intact_manifest", then_removed)
+        with store.slot(stage="toy", version=1, key="toy-v1-aa", renew=True) as slot:
+            (slot.path / "deep").mkdir()
+            (slot.path / "deep" / "file.txt").write_text("hello")
+        assert (store.open(slot.ref) / "deep" / "file.txt").read_text() == "hello"
 
     def test_several_processes_write_one_key(self, tmp_path: Path) -> None:
         context = multiprocessing.get_context("spawn")
