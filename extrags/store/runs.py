@@ -14,6 +14,7 @@ import logging
 import os
 import secrets
 import threading
+import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -28,6 +29,8 @@ __all__ = ["Run", "RunRecord", "active_runs", "file_killed", "forget", "recorded
 log = logging.getLogger(__name__)
 
 _PREFIX = "run-"
+_LOOKS, _BETWEEN_LOOKS_S = 20, 0.05
+"""How often a record that is half written is read again."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,7 @@ class RunRecord:
         self._store, self._sequence, self._config = store, sequence, config
         self._keys: set[str] = set()
         self._guard = threading.Lock()
+        self._written = b""
         self.interrupted = False
         folder = store.state / "runs" / "active"
         folder.mkdir(parents=True, exist_ok=True)
@@ -73,12 +77,18 @@ class RunRecord:
             raise
 
     def add(self, keys: Iterable[str]) -> None:
-        """Artefacts that the run uses."""
+        """Artefacts that the run uses.
+
+        Where they cannot be written, as to a full disk, the run goes on: retention alone misses them.
+        """
         with self._guard:
             more = set(keys) - self._keys
             if more:
                 self._keys |= more
-                self._write()
+                try:
+                    self._write()
+                except OSError as error:
+                    log.warning("the record of this run could not be written: %s", error)
 
     def close(self) -> None:
         """The run has ended, well or not. The same artefacts again replace the record of the former run."""
@@ -96,8 +106,13 @@ class RunRecord:
 
     def _write(self) -> None:
         text = json.dumps(self._content()).encode()
-        os.pwrite(self._file, text, 0)
-        os.ftruncate(self._file, len(text))
+        try:
+            _write_all(self._file, text)
+        except OSError:
+            # There is room for what was there before: half of the new one would say nothing.
+            _write_all(self._file, self._written)
+            raise
+        self._written = text
 
     def _content(self) -> dict[str, Any]:
         content = {"sequence": self._sequence, "ended": _now(), "keys": sorted(self._keys)}
@@ -187,10 +202,24 @@ def _unfinished(store: Store) -> Iterator[tuple[Run, bool]]:
             os.close(file)
         try:
             run = _parsed(f"active/{path.name}", path.read_bytes())
+            for _ in range(_LOOKS if going_on else 0):
+                if run is not None:
+                    break
+                # Its process is writing it now: what it uses must not be passed over.
+                time.sleep(_BETWEEN_LOOKS_S)
+                run = _parsed(f"active/{path.name}", path.read_bytes())
         except FileNotFoundError:
             continue  # It ended meanwhile; its record is among the others.
         if run is not None:
             yield run, going_on
+
+
+def _write_all(file: int, text: bytes) -> None:
+    """Make a text the content of an open file; a full disk takes a part, and says so at the next."""
+    done = 0
+    while done < len(text):
+        done += os.pwrite(file, text[done:], done)
+    os.ftruncate(file, len(text))
 
 
 def _parsed(name: str, text: bytes) -> Run | None:

@@ -326,6 +326,40 @@ def test_a_run_that_cannot_be_recorded_holds_no_lock(
     assert len(os.listdir("/proc/self/fd")) == before
 
 
+def test_a_disk_that_is_full_in_the_middle_ends_no_run_and_keeps_the_record(
+    store: Store, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    usual, full_from = os.pwrite, len(store.root) + 200
+
+    def nearly_full(file: int, text: bytes, offset: int) -> int:
+        if offset >= full_from:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return usual(file, text[: full_from - offset], offset)
+
+    monkeypatch.setattr(os, "pwrite", nearly_full)
+    with recorded_run(store, "phantom/0") as record:
+        assert record is not None
+        record.add(["ingest-v1-00"])
+        record.add(f"coarse-v1-{number:032d}" for number in range(20))
+        (run,) = active_runs(store)
+        assert run.keys == {"ingest-v1-00"}
+        assert "could not be written: [Errno 28]" in caplog.text
+    (ended,) = runs_of(store)
+    assert len(ended.keys) == 21
+
+
+def test_a_record_that_is_half_written_is_read_again(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    with recorded_run(store, "phantom/0") as record:
+        assert record is not None
+        record.add(["ingest-v1-00"])
+        (path,) = (store.state / "runs" / "active").iterdir()
+        whole = path.read_bytes()
+        path.write_bytes(whole[:-9])
+        monkeypatch.setattr("time.sleep", lambda _: path.write_bytes(whole))
+        (run,) = active_runs(store)
+        assert run.keys == {"ingest-v1-00"}
+
+
 def test_a_record_is_plain_json(store: Store) -> None:
     with recorded_run(store, "phantom/0") as record:
         assert record is not None
