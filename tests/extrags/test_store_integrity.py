@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import pickle
 import uuid
 from collections.abc import Callable, Iterator
@@ -360,6 +362,36 @@ class TestSetAside:
         assert place.store.rm("phantom/*") == []
         assert place.store.rm(pattern) == [KEY]
         assert place.store.keys() == []
+
+    def test_a_manifest_that_the_disk_does_not_give_back_is_damage_to_who_looks_through_the_store(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        store = Store(tmp_path)
+        put(store)
+        usual, number = Path.read_bytes, errno.EIO
+
+        def failing(path: Path) -> bytes:
+            if path.name == MANIFEST and path.parent.is_dir():
+                raise OSError(number, os.strerror(number), str(path))
+            return usual(path)
+
+        monkeypatch.setattr(Path, "read_bytes", failing)
+        # It may pass: who needs the artefact tries again before it is given up.
+        with pytest.raises(StoreError) as found:
+            store.find(KEY)
+        assert not isinstance(found.value, DamagedArtefactError)
+        assert store.ls() == []
+        assert "manifest.json: cannot be read: Input/output error" in caplog.text
+        damage = store.examine(KEY)
+        assert isinstance(damage, DamagedArtefactError)
+        assert store.set_aside(damage) is not None
+        assert store.find(KEY) is None
+        # What this user may not read may be whole.
+        (tmp_path / "artefacts" / KEY).mkdir()
+        number = errno.EACCES
+        for look in (store.ls, lambda: store.examine(KEY), lambda: store.rm("*")):
+            with pytest.raises(StoreError, match="Permission denied"):
+                look()
 
     def test_writing_the_same_again_replaces_a_damaged_artefact(self, place: Place) -> None:
         ref = put(place.store)
