@@ -112,6 +112,7 @@ def reconstruct_dataset(
         log.info("%s: none of %d runs is %s; nothing to do", name, len(every), only)
         return DatasetOutcome([])
     one = reconstruct_sequence.with_options(task_runner=task_runner(runner, at_once))
+    through: set[str] = set()
 
     def reconstruct(case: SequenceCase) -> SequenceOutcome:
         state: State[Any] = one(
@@ -120,7 +121,8 @@ def reconstruct_dataset(
             settings=dict(case.settings) or None,
             seed=case.seed,
             store=store,
-            refresh=refresh,
+            # All are looked up again where the page meets damage: what is anew by then is not made again.
+            refresh=refresh and case.title not in through,
             until=until,
             method=case.method,
             limits=limits,
@@ -129,6 +131,8 @@ def reconstruct_dataset(
         )
         outcome = _case_outcome(case, state, store, until)
         outcome.seed = case.seed if len(seeds or ()) > 1 else None
+        if outcome.status == "ok":
+            through.add(case.title)
         page.sequence_ended(outcome, store)
         return outcome
 

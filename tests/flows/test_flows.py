@@ -13,12 +13,13 @@ from prefect.artifacts import Artifact
 from prefect.client.schemas.objects import FlowRun
 from prefect.context import FlowRunContext
 from prefect.flows import Flow, load_flow_from_entrypoint
+from prefect.states import Completed
 from prefect.task_runners import ThreadPoolTaskRunner
 
 import extrags.cores
 import flows.dataset
 import tasks.progress
-from extrags.errors import ConfigError, StoreError
+from extrags.errors import ArtefactGoneError, ConfigError, StoreError
 from extrags.stages import STAGES
 from extrags.store import Store
 from flows.dataset import reconstruct_dataset
@@ -170,6 +171,34 @@ def test_an_interrupted_dataset_begins_no_more_sequences(
     assert len(begun) <= 3
     assert all(told)
     assert not interrupted.is_set(), "further runs of this process are not interrupted"
+
+
+def test_a_dataset_is_made_anew_once_though_its_page_meets_damage(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[str, bool]] = []
+
+    def one(*, sequence: str, refresh: bool, **_: object) -> Any:
+        asked.append((sequence, refresh))
+        status: Any = "ok" if sequence == "phantom/0" else "failed"
+        return Completed(data=SequenceOutcome(sequence, status))
+
+    class Started:
+        def with_options(self, **_: object) -> Any:
+            return one
+
+    def page(*_: object) -> str:
+        if len(asked) == 2:
+            raise ArtefactGoneError("it was removed meanwhile", "report-v1-00")
+        return "page"
+
+    monkeypatch.setattr(flows.dataset, "reconstruct_sequence", Started())
+    monkeypatch.setattr(flows.dataset, "dataset_page", page)
+    monkeypatch.setattr(flows.dataset, "create_markdown_artifact", lambda *_, **__: None)
+    sequences = ["phantom/0", "phantom/1"]
+    reconstruct_dataset.fn(sequences, profile="quick", store=str(tmp_path), refresh=True)
+    # What failed is tried as before; what came through is found in the store.
+    assert asked == [("phantom/0", True), ("phantom/1", True), ("phantom/0", False), ("phantom/1", True)]
 
 
 @pytest.mark.parametrize("inner", [False, True])
