@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import re
 import sys
 import time
@@ -229,9 +230,11 @@ def execute(
         # Wrong usage is said before anything is made or loaded.
         run_config(given)
     own_home = has_own_home()
-    prepare(Store(root).state, debug=given.debug)
+    prepare(Store(root).state, debug=given.debug, looks=True)
     always = refresh or always_flow
-    if own_home and (always or not all(_may_be_finished(root, name, until) for name in sequences)):
+    finished = not always and all(_may_be_finished(root, name, until) for name in sequences)
+    # Without a home the store cannot be written; that is said below where something is to be made.
+    if own_home and not finished and Path(os.environ["PREFECT_HOME"]).is_dir():
         start_early()
     cases = _cases(sequences, given, several, root, until)
     try:
