@@ -481,9 +481,12 @@ class Store:
         removed = self.backend.sweep(older_than_hours, dry_run=dry_run)
         failures = self.state / "failed"
         if failures.is_dir():
-            removed += [f"failed/{entry.name}" for entry in sorted(failures.iterdir())]
-            if not dry_run:
-                shutil.rmtree(failures)
+            for entry in sorted(failures.iterdir()):
+                removed.append(f"failed/{entry.name}")
+                if not dry_run:
+                    # Another machine may clean the same store at the same hour.
+                    with suppress(FileNotFoundError):
+                        shutil.rmtree(entry)
         return removed + self.backend.remove_damaged(dry_run=dry_run)
 
 

@@ -152,17 +152,20 @@ class DirectoryBackend:
         try:
             (self.artefacts / key).rename(place / "artefact")
         except FileNotFoundError:
-            shutil.rmtree(place)
+            # The artefact is gone, or this place is, removed by who cleans the store: then it stays where it
+            # is, to be replaced.
+            shutil.rmtree(place, ignore_errors=True)
             return None
         return str(place)
 
     def remove_damaged(self, *, dry_run: bool = False) -> list[str]:
         """Remove what was set aside; returns the names."""
         place = self.root / DAMAGED
-        names = [f"{DAMAGED}/{name}" for name in sorted(os.listdir(place))] if place.is_dir() else []
-        if not dry_run:
-            shutil.rmtree(place, ignore_errors=True)
-        return names
+        names = sorted(os.listdir(place)) if place.is_dir() else []
+        # One by one: what is set aside meanwhile stays.
+        for name in [] if dry_run else names:
+            shutil.rmtree(place / name, ignore_errors=True)
+        return [f"{DAMAGED}/{name}" for name in names]
 
     def write_record(self, name: str, text: bytes) -> None:
         """Write `records/<name>`; one that is there is replaced at once, never half."""

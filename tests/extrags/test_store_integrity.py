@@ -6,6 +6,7 @@ import errno
 import json
 import os
 import pickle
+import shutil
 import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -337,6 +338,31 @@ class TestSetAside:
         (removed,) = place.store.gc()
         assert removed.startswith(f"damaged/{KEY}.")
         assert place.store.gc() == []
+
+    def test_two_may_clean_at_once(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        store = Store(tmp_path)
+        for name in ("first", "second"):
+            (tmp_path / "failed" / name).mkdir(parents=True)
+        usual = shutil.rmtree
+
+        def slower(place: Path, *given: Any, **more: Any) -> None:
+            if Path(place).name == "first":
+                usual(place)
+            usual(place, *given, **more)
+
+        with monkeypatch.context() as patched:
+            patched.setattr(shutil, "rmtree", slower)
+            assert store.gc() == ["failed/first", "failed/second"]
+        assert list((tmp_path / "failed").iterdir()) == []
+        # What is being set aside loses its place.
+        put(store)
+        (tmp_path / "artefacts" / KEY / CHUNK).unlink()
+        rename = Path.rename
+        monkeypatch.setattr(Path, "rename", lambda path, to: (usual(to.parent), rename(path, to))[1])
+        assert store.find_or_set_aside(KEY) is None
+        monkeypatch.undo()
+        put(store)
+        assert store.find(KEY) is not None
 
     def test_what_another_process_has_made_anew_stays(self, place: Place) -> None:
         ref = put(place.store)
