@@ -14,6 +14,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
+from extrags.errors import StoreError
 from extrags.stages import PAGES_OF_SEVERAL, all_tasks
 from extrags.store.artefacts import Store
 from extrags.store.manifest import Manifest, stage_of
@@ -182,20 +183,38 @@ def _planned(
 
 
 def apply_policy(store: Store, policy: Policy) -> list[Removal]:
-    """Remove what a policy does not keep; returns what was removed."""
+    """Remove what a policy does not keep; returns what was removed.
+
+    What cannot be removed, as an artefact of another user, stays with what it was made from, and hinders no
+    other.
+
+    Raises:
+        StoreError: when something could not be removed; all else has been by then.
+    """
     contents = _Contents(store)
     plan, gone = _planned(store, policy, contents, time.time())
     removed = []
     spared: set[str] = set()
+    refused: dict[str, StoreError] = {}
     for item in plan:
         # A run may have begun to use it since; then it needs what that was made from.
         if item.key not in spared:
             used = store.backend.last_used([item.key]).get(item.key, 0.0)
             if used > time.time() - MOMENT_S:
                 spared |= contents.with_inputs([item.key])
-            elif store.backend.discard(item.key):
-                removed.append(item)
-    forget(store, gone)
+                continue
+            try:
+                if store.backend.discard(item.key):
+                    removed.append(item)
+            except StoreError as error:
+                refused[item.key] = error
+                spared |= contents.with_inputs([item.key])
+    forget(store, [run for run in gone if not run.keys & refused.keys()])
+    if refused:
+        first = next(iter(refused.values()))
+        raise StoreError(
+            f"{len(refused)} of {len(removed) + len(refused)} artefacts could not be removed: {first}"
+        ) from first
     return removed
 
 

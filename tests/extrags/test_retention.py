@@ -14,7 +14,9 @@ from pathlib import Path
 
 import pytest
 
+from extrags.errors import StoreError
 from extrags.store import Ref, Store
+from extrags.store.directory import DirectoryBackend
 from extrags.store.records import remove_record
 from extrags.store.retention import Policy, Removal, apply_policy, planned_removals, usage
 from extrags.store.runs import active_runs, file_killed, recorded_run, runs_of
@@ -283,6 +285,21 @@ def test_nothing_is_removed_that_a_run_has_begun_to_use_since(
 
     monkeypatch.setattr(retention, "_planned", and_then_it_is_found)
     assert names(apply_policy(chain, Policy(older_than_s=DAY_S))) == ["report", "other"]
+    assert chain.keys() == ["coarse-v1-00", "ingest-v1-00"]
+
+
+def test_what_cannot_be_removed_hinders_no_other(chain: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    usual = DirectoryBackend.discard
+
+    def discard(backend: DirectoryBackend, key: str) -> bool:
+        if key == "coarse-v1-00":
+            raise StoreError(f"{key} cannot be removed: Permission denied")
+        return usual(backend, key)
+
+    monkeypatch.setattr(DirectoryBackend, "discard", discard)
+    with pytest.raises(StoreError, match=r"1 of 3 artefacts could not be removed: coarse-v1-00 cannot"):
+        apply_policy(chain, Policy(older_than_s=0.0, with_inputs=True))
+    # It stays with what it was made from.
     assert chain.keys() == ["coarse-v1-00", "ingest-v1-00"]
 
 
