@@ -78,7 +78,7 @@ class SequenceUsage:
         files: number, manifests among them.
         bytes: of all files but manifests.
         made: the latest, UTC, ISO 8601.
-        used: the latest; on object stores, when it was made.
+        used: the latest; on object stores, when it was made, or a run on record ended that used it.
     """
 
     sequence: str
@@ -90,12 +90,24 @@ class SequenceUsage:
 
 
 class _Contents:
-    """The artefacts of a store, what they were made from, and when they were used last."""
+    """The artefacts of a store, what they were made from, and when they were used last.
 
-    def __init__(self, store: Store) -> None:
+    Where a store keeps no time of use, as object stores, the records of runs tell.
+
+    Args:
+        store: which.
+        runs: that ended.
+    """
+
+    def __init__(self, store: Store, runs: Iterable[Run]) -> None:
         self.manifests = {manifest.key: manifest for manifest in store.ls()}
         used = store.backend.last_used(self.manifests)
         self.used = {key: used.get(key, _made(item)) for key, item in self.manifests.items()}
+        for run in runs:
+            ended = _moment(run.ended)
+            for key in run.keys & self.used.keys():
+                if key not in used:
+                    self.used[key] = max(self.used[key], ended)
 
     def with_inputs(self, keys: Iterable[str]) -> set[str]:
         """Artefacts, and all those they were made from."""
@@ -134,13 +146,21 @@ def planned_removals(
         The artefacts in the order of their removal, what was made from others before these; and the runs
         whose records go with them.
     """
-    return _planned(store, policy, _Contents(store), time.time() if now is None else now)
+    return _planned(policy, *_looked_over(store), time.time() if now is None else now)
+
+
+def _looked_over(store: Store) -> tuple[_Contents, list[Run], list[Run]]:
+    """What there is, the runs that ended, and those that are going on."""
+    # Before and after: one that ends meanwhile is among the others, and one may begin.
+    going_on = active_runs(store)
+    runs = runs_of(store)
+    contents = _Contents(store, runs)
+    return contents, runs, [*going_on, *active_runs(store)]
 
 
 def _planned(
-    store: Store, policy: Policy, contents: _Contents, now: float
+    policy: Policy, contents: _Contents, runs: list[Run], going_on: list[Run], now: float
 ) -> tuple[list[Removal], list[Run]]:
-    runs, going_on = runs_of(store), active_runs(store)
     runs = [replace(run, ended=max(run.ended, _last_time(run, contents))) for run in runs]
     kept_runs, former = _last_runs(_with_pages(runs, contents), policy.keep_last)
     of_kept = {key for run in kept_runs for key in run.keys}
@@ -191,8 +211,8 @@ def apply_policy(store: Store, policy: Policy) -> list[Removal]:
     Raises:
         StoreError: when something could not be removed; all else has been by then.
     """
-    contents = _Contents(store)
-    plan, gone = _planned(store, policy, contents, time.time())
+    contents, runs, going_on = _looked_over(store)
+    plan, gone = _planned(policy, contents, runs, going_on, time.time())
     removed = []
     spared: set[str] = set()
     refused: dict[str, StoreError] = {}
@@ -220,7 +240,7 @@ def apply_policy(store: Store, policy: Policy) -> list[Removal]:
 
 def usage(store: Store) -> list[SequenceUsage]:
     """What each sequence uses, the largest first."""
-    contents = _Contents(store)
+    contents = _Contents(store, runs_of(store))
     by_sequence: dict[str, list[Manifest]] = defaultdict(list)
     for item in contents.manifests.values():
         by_sequence[item.label].append(item)
@@ -304,10 +324,16 @@ def _is_intermediate(key: str) -> bool:
 
 
 def _made(manifest: Manifest) -> float:
+    started = _moment(manifest.started)
+    return started + manifest.seconds if started else 0.0  # The first manifests had no date.
+
+
+def _moment(text: str) -> float:
+    """Seconds since 1970 of a date; 0 of none."""
     try:
-        return datetime.datetime.fromisoformat(manifest.started).timestamp() + manifest.seconds
+        return datetime.datetime.fromisoformat(text).timestamp()
     except ValueError:
-        return 0.0  # The first manifests had no date.
+        return 0.0
 
 
 def _date(moment: float) -> str:

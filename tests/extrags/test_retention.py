@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import errno
 import json
 import os
@@ -242,6 +243,26 @@ class TestRuns:
         assert len(planned_removals(store, Policy(older_than_s=3600.0), now=later)[0]) == 3
         remove_record(store, runs_of(store)[0].name)
         assert runs_of(store) == []
+
+    def test_what_runs_go_on_to_use_on_an_object_store_stays(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """Nothing there has a time of use: a night that finds everything is a use all the same."""
+        store = Store(f"memory://{uuid.uuid4().hex}", cache=tmp_path)
+        put(store, "report", sequence=put(store, "ingest"))
+        put(store, "other")
+        nights = time.time() + 100 * DAY_S
+        with monkeypatch.context() as patched:
+            told = datetime.datetime.fromtimestamp(nights, datetime.UTC).isoformat(timespec="microseconds")
+            patched.setattr("extrags.store.runs._now", lambda: told)
+            with recorded_run(store, "phantom/0") as record:
+                assert record is not None
+                record.add(["ingest-v1-00", "report-v1-00"])
+        old = Policy(older_than_s=90 * DAY_S)
+        assert names(planned_removals(store, old, now=nights + DAY_S)[0]) == ["other"]
+        assert len(planned_removals(store, old, now=nights + 91 * DAY_S)[0]) == 3
+        (row,) = usage(store)
+        assert row.used == told[:19] + "+00:00"
 
 
 class TestVersions:
