@@ -35,7 +35,7 @@ from flows.commands.options import (
     add_stages,
     number_above_zero,
 )
-from flows.commands.run_checks import check_methods, check_names, check_working_distance, wrong_source
+from flows.commands.run_checks import check_names, check_working_distance, wrong_source
 from flows.failures import describe_error
 from flows.interruption import RESUMABLE, say_when_interrupted
 from flows.outcome import DatasetFailedError, DatasetOutcome, SequenceOutcome
@@ -254,8 +254,10 @@ def execute(
         stop_early()
         _record(cases[0], refused, root, until)
         return _raised(DatasetOutcome([refused]), given)
-    check_methods(cases, several.methods, until)
+    from flows.preflight import preflight_cases
     from flows.selection import absolute_manifests
+
+    preflight_cases(cases, until)
 
     # Names were checked by the parser; flows have literals for them.
     arguments: dict[str, Any] = {
