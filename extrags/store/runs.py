@@ -101,8 +101,10 @@ class RunRecord:
             self._end()
 
     def _end(self) -> None:
-        self._path.unlink(missing_ok=True)
-        os.close(self._file)
+        try:
+            self._path.unlink(missing_ok=True)
+        finally:
+            os.close(self._file)
 
     def _write(self) -> None:
         text = json.dumps(self._content()).encode()
