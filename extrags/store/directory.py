@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import json
 import os
@@ -186,6 +187,10 @@ class DirectoryBackend:
                 found[name] = (place / name).read_bytes()
             except FileNotFoundError:
                 continue  # Removed meanwhile.
+            except OSError as error:
+                if error.errno != errno.EIO:
+                    raise
+                found[name] = b""  # The disk does not give it back: it is damaged, and the others are not.
         return found
 
     def remove_record(self, name: str) -> None:
