@@ -27,7 +27,7 @@ from flows.pages import dataset_page
 from flows.parameters import Matrix, Sequences, Settings, StoreRoot
 from flows.preflight import preflight_cases
 from flows.run_page import run_page
-from flows.runners import PrefectRunner
+from flows.runners import PrefectRunner, refreshed_once
 from flows.selection import chosen_sequences
 from flows.sequence import open_store, reconstruct_sequence
 from flows.settings import run_store, task_runner
@@ -112,7 +112,6 @@ def reconstruct_dataset(
         log.info("%s: none of %d runs is %s; nothing to do", name, len(every), only)
         return DatasetOutcome([])
     one = reconstruct_sequence.with_options(task_runner=task_runner(runner, at_once))
-    through: set[str] = set()
 
     def reconstruct(case: SequenceCase) -> SequenceOutcome:
         state: State[Any] = one(
@@ -121,8 +120,7 @@ def reconstruct_dataset(
             settings=dict(case.settings) or None,
             seed=case.seed,
             store=store,
-            # All are looked up again where the page meets damage: what is anew by then is not made again.
-            refresh=refresh and case.title not in through,
+            refresh=refresh,
             until=until,
             method=case.method,
             limits=limits,
@@ -131,8 +129,6 @@ def reconstruct_dataset(
         )
         outcome = _case_outcome(case, state, store, until)
         outcome.seed = case.seed if len(seeds or ()) > 1 else None
-        if outcome.status == "ok":
-            through.add(case.title)
         page.sequence_ended(outcome, store)
         return outcome
 
@@ -155,6 +151,8 @@ def reconstruct_dataset(
     with (
         run_lease(store),
         run_page(name, config, until, sequences=len(cases), bars=False, work=work) as page,
+        # Also where all are looked up again, since the page of all met damage.
+        refreshed_once(),
     ):
         found = again_after_damage(Store(store), run_all)
         if found.report is not None:

@@ -13,7 +13,6 @@ from prefect.artifacts import Artifact
 from prefect.client.schemas.objects import FlowRun
 from prefect.context import FlowRunContext
 from prefect.flows import Flow, load_flow_from_entrypoint
-from prefect.states import Completed
 from prefect.task_runners import ThreadPoolTaskRunner
 
 import extrags.cores
@@ -173,32 +172,37 @@ def test_an_interrupted_dataset_begins_no_more_sequences(
     assert not interrupted.is_set(), "further runs of this process are not interrupted"
 
 
-def test_a_dataset_is_made_anew_once_though_its_page_meets_damage(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked: list[tuple[str, bool]] = []
+@pytest.mark.usefixtures("prefect_server")
+def test_a_dataset_makes_each_stage_anew_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also what its runs share, and where the page of all of them meets damage."""
+    slot, build = Store.slot, flows.dataset.dataset_page
+    made: list[str] = []
+    pages: list[Any] = []
 
-    def one(*, sequence: str, refresh: bool, **_: object) -> Any:
-        asked.append((sequence, refresh))
-        status: Any = "ok" if sequence == "phantom/0" else "failed"
-        return Completed(data=SequenceOutcome(sequence, status))
+    def counted(store: Store, *, key: str, **more: Any) -> Any:
+        made.append(key)
+        return slot(store, key=key, **more)
 
-    class Started:
-        def with_options(self, **_: object) -> Any:
-            return one
-
-    def page(*_: object) -> str:
-        if len(asked) == 2:
+    def page(*given: Any) -> str:
+        pages.append(given)
+        if len(pages) == 1:
             raise ArtefactGoneError("it was removed meanwhile", "report-v1-00")
-        return "page"
+        return build(*given)
 
-    monkeypatch.setattr(flows.dataset, "reconstruct_sequence", Started())
+    monkeypatch.setattr(Store, "slot", counted)
     monkeypatch.setattr(flows.dataset, "dataset_page", page)
-    monkeypatch.setattr(flows.dataset, "create_markdown_artifact", lambda *_, **__: None)
-    sequences = ["phantom/0", "phantom/1"]
-    reconstruct_dataset.fn(sequences, profile="quick", store=str(tmp_path), refresh=True)
-    # What failed is tried as before; what came through is found in the store.
-    assert asked == [("phantom/0", True), ("phantom/1", True), ("phantom/0", False), ("phantom/1", True)]
+    found = reconstruct_dataset(
+        sequences=[SEQUENCE],
+        profile="quick",
+        settings={**TINY, "coarse.iterations": 20},
+        store=str(tmp_path),
+        methods=["coarse", "3dgs"],
+        refresh=True,
+    )
+    assert [outcome.status for outcome in found.sequences] == ["ok", "ok"]
+    assert len(pages) == 2
+    assert len(set(made)) == len(made) > 8
+    assert sum(key.startswith("ingest-") for key in made) == 1
 
 
 @pytest.mark.parametrize("inner", [False, True])
