@@ -494,7 +494,7 @@ def _as_damage(error: StoreError, key: str, root: str) -> DamagedArtefactError:
     """What is wrong with an artefact whose manifest could not be read.
 
     A disk that does not give it back has damaged it, for who looks through the whole store; who needs it
-    tries again first (`flows.limits`).
+    tries again first (`flows.limits`). Object stores answer so when they are busy.
 
     Raises:
         StoreError: the error itself, where it tells nothing of this artefact.
@@ -502,7 +502,7 @@ def _as_damage(error: StoreError, key: str, root: str) -> DamagedArtefactError:
     if isinstance(error, DamagedArtefactError):
         return error
     cause = error.__cause__
-    if not isinstance(cause, OSError) or cause.errno != errno.EIO:
+    if "://" in root or not isinstance(cause, OSError) or cause.errno != errno.EIO:
         raise error
     problem = f"cannot be read: {cause.strerror}"
     return DamagedArtefactError(problem, file=MANIFEST, stage=stage_of(key), key=key, store=root)

@@ -17,6 +17,7 @@ import pytest
 
 from extrags.errors import ArtefactGoneError, ConfigError, DamagedArtefactError, StoreError
 from extrags.store import MANIFEST, Manifest, Ref, Storable, Store
+from extrags.store.artefacts import _as_damage
 from extrags.store.manifest import manifest_text
 from extrags.zarr_io import new_group, open_group, read_array, write_array, write_frames
 
@@ -412,6 +413,9 @@ class TestSetAside:
         assert isinstance(damage, DamagedArtefactError)
         assert store.set_aside(damage) is not None
         assert store.find(KEY) is None
+        # An object store answers so when it is busy.
+        with pytest.raises(StoreError, match="busy"):
+            _as_damage(_caused_by(OSError(errno.EIO, "busy")), KEY, "s3://bucket")
         # What this user may not read may be whole.
         (tmp_path / "artefacts" / KEY).mkdir()
         number = errno.EACCES
@@ -424,6 +428,12 @@ class TestSetAside:
         place.change(CHUNK, flipped)
         assert put(place.store) == ref
         assert place.store.verify(ref)
+
+
+def _caused_by(cause: OSError) -> StoreError:
+    error = StoreError(str(cause))
+    error.__cause__ = cause
+    return error
 
 
 class TestSlot:
