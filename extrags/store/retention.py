@@ -296,7 +296,8 @@ def _last_runs(runs: list[Run], count: int | None) -> tuple[list[Run], list[Run]
         return runs, []
     by_sequence: dict[str, list[Run]] = defaultdict(list)
     for run in runs:
-        by_sequence[run.sequence].append(run)
+        # Relative names of several places may be the same.
+        by_sequence[run.place or run.sequence].append(run)
     kept = []
     for each in by_sequence.values():
         # Of those that used the same the last one stands for all.

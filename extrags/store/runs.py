@@ -45,6 +45,8 @@ class Run:
         interrupted: whether it was told to stop or was killed before its end; records of earlier versions do
             not tell.
         config: digest of its settings; empty where it is not known.
+        place: absolute path of a sequence that is named by a relative one; empty for others, and in records
+            of earlier versions.
     """
 
     name: str
@@ -53,13 +55,15 @@ class Run:
     keys: frozenset[str]
     interrupted: bool = False
     config: str = ""
+    place: str = ""
 
 
 class RunRecord:
     """The record of a run that is going on; see `recorded_run`."""
 
-    def __init__(self, store: Store, sequence: str, config: str = "") -> None:
+    def __init__(self, store: Store, sequence: str, config: str = "", place: str = "") -> None:
         self._store, self._sequence, self._config = store, sequence, config
+        self._place = "" if place == sequence else place
         self._keys: set[str] = set()
         self._guard = threading.Lock()
         self._written = b""
@@ -94,7 +98,7 @@ class RunRecord:
         """The run has ended, well or not. The same artefacts again replace the record of the former run."""
         try:
             if self._keys:
-                name = _PREFIX + digest_of([self._sequence, sorted(self._keys)])
+                name = _record_name(self._sequence, self._place, self._keys)
                 write_record(self._store, name, self._content())
         finally:
             # Held on to, the lock would tell of a run that goes on for as long as this process lives.
@@ -119,20 +123,24 @@ class RunRecord:
     def _content(self) -> dict[str, Any]:
         content = {"sequence": self._sequence, "ended": _now(), "keys": sorted(self._keys)}
         content |= {"config": self._config} if self._config else {}
+        content |= {"place": self._place} if self._place else {}
         return content | ({"interrupted": True} if self.interrupted else {})
 
 
 @contextmanager
-def recorded_run(store: Store, sequence: str, config: str = "") -> Iterator[RunRecord | None]:
+def recorded_run(
+    store: Store, sequence: str, config: str = "", place: str = ""
+) -> Iterator[RunRecord | None]:
     """Record the run inside the block; None where the store cannot be written, as for who only looks.
 
     Args:
         store: of its artefacts.
         sequence: its display name.
         config: digest of its settings; empty for none.
+        place: absolute path of a sequence that is one.
     """
     try:
-        record = RunRecord(store, sequence, config)
+        record = RunRecord(store, sequence, config, place)
     except OSError as error:
         log.debug("no record of this run: %s", error)
         yield None
@@ -172,7 +180,8 @@ def file_killed(store: Store) -> list[str]:
             continue
         if run.keys:
             content = {"sequence": run.sequence, "ended": run.ended, "keys": sorted(run.keys)}
-            name = _PREFIX + digest_of([run.sequence, sorted(run.keys)])
+            content |= {"place": run.place} if run.place else {}
+            name = _record_name(run.sequence, run.place, run.keys)
             write_record(store, name, content | {"interrupted": True})
         (store.state / "runs" / run.name).unlink(missing_ok=True)
         filed.append(f"runs/{run.name}")
@@ -186,6 +195,10 @@ def forget(store: Store, runs: Iterable[Run]) -> None:
             (store.state / "runs" / run.name).unlink(missing_ok=True)
         else:
             remove_record(store, run.name)
+
+
+def _record_name(sequence: str, place: str, keys: Iterable[str]) -> str:
+    return _PREFIX + digest_of([sequence, *([place] if place else []), sorted(keys)])
 
 
 def _unfinished(store: Store) -> Iterator[tuple[Run, bool]]:
@@ -235,8 +248,8 @@ def _run(name: str, record: dict[str, Any]) -> Run | None:
     try:
         keys = frozenset(map(str, record["keys"]))
         interrupted = record.get("interrupted") is True
-        config = str(record.get("config", ""))
-        return Run(name, str(record["sequence"]), str(record["ended"]), keys, interrupted, config)
+        config, place = (str(record.get(field, "")) for field in ("config", "place"))
+        return Run(name, str(record["sequence"]), str(record["ended"]), keys, interrupted, config, place)
     except (KeyError, TypeError):
         return None
 

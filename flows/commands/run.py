@@ -435,12 +435,13 @@ def _from_store(
 
 def _record(case: SequenceCase, outcome: SequenceOutcome, root: str, until: StageName) -> None:
     """Leave on record how a run ended and what it used, if the store can be written."""
+    from data_catalog.names import path_of
     from extrags.store import Store
     from extrags.store.runs import recorded_run
     from flows.cases import record_outcome_quietly
 
     store = Store(root)
-    with recorded_run(store, case.sequence) as used:
+    with recorded_run(store, case.sequence, place=path_of(case.sequence) or "") as used:
         if used is not None:
             used.add(key for row in outcome.stages for key in row.made)
     record_outcome_quietly(store, case, outcome, until, case.config())

@@ -120,6 +120,17 @@ class TestRuns:
         assert planned(three, keep_last=2) == ["judged0", "final0"]
         assert planned(three, keep_last=1) == ["judged0", "judged1", "final0", "final1"]
 
+    def test_relative_names_of_several_places_are_several_sequences(self, store: Store) -> None:
+        """Two groups share a store, and both call a folder of theirs `scan`."""
+        for place in ("/a/scan", "/b/scan"):
+            name = f"judged{place[1]}"
+            put(store, name, days=30, label="scan")
+            with recorded_run(store, "scan", place=place) as record:
+                assert record is not None
+                record.add([f"{name}-v1-00"])
+        assert {run.place for run in runs_of(store)} == {"/a/scan", "/b/scan"}
+        assert planned(store, keep_last=1) == []
+
     def test_the_same_run_again_counts_once_and_is_the_last(self, three: Store) -> None:
         assert len(runs_of(three)) == 4
         with recorded_run(three, "phantom/0") as record:
