@@ -6,6 +6,8 @@ datasets are asked in order; what each of them knows stands in its own module.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from difflib import get_close_matches
 from os import PathLike, fspath
 from pathlib import Path
@@ -25,7 +27,7 @@ from data_catalog.specular import with_specular
 from data_catalog.stereo import check_one_camera
 from extrags.arguments import check_settings_argument
 from extrags.config import DEFAULT_PROFILE, PROFILES, IngestConfig
-from extrags.errors import ConfigError, SourceNotFoundError, UnknownSequenceError
+from extrags.errors import ConfigError, SourceError, SourceNotFoundError, UnknownSequenceError
 from extrags.redaction import without_credentials
 from extrags.scarce_depth import without_scarce_depth
 from extrags.sequence import EndoscopicSequence
@@ -86,7 +88,8 @@ def resolve(name_or_path: str | Path) -> Source:
         UnknownSequenceError: neither a known name nor an existing path; suggests the nearest name.
             Nor is an empty text.
         SourceNotFoundError: a known name whose files are not on this machine.
-        SourceError: a folder that holds no sequence, or a file where a folder is needed.
+        SourceError: a folder that holds no sequence, a file where a folder is needed, or one that this user
+            may not read.
         ConfigError: neither a text nor a path, such as a sequence that was read before.
     """
     if not isinstance(name_or_path, str | PathLike):
@@ -94,11 +97,12 @@ def resolve(name_or_path: str | Path) -> Source:
     text = fspath(name_or_path)
     if not text.strip():
         raise UnknownSequenceError("the name is empty; expected a sequence's name or a path")
-    for dataset in DATASETS:
-        found = dataset.resolve(text)
-        if found is not None:
-            return found
-    raise _unknown(text)
+    with _permission_named():
+        for dataset in DATASETS:
+            found = dataset.resolve(text)
+            if found is not None:
+                return found
+        raise _unknown(text)
 
 
 def glance(name_or_path: str | Path, config: IngestConfig | None = None) -> Glance | None:
@@ -122,7 +126,8 @@ def glance(name_or_path: str | Path, config: IngestConfig | None = None) -> Glan
     dataset = _dataset(source)
     _check_own(dataset, source, config)
     _check_time_span(source, config)
-    return dataset.glance(source, config) if isinstance(dataset, FolderDataset) else None
+    with _permission_named():
+        return dataset.glance(source, config) if isinstance(dataset, FolderDataset) else None
 
 
 def read(source: Source | str | Path, config: IngestConfig | None = None) -> EndoscopicSequence:
@@ -196,7 +201,8 @@ def source_fingerprint(source: Source | str | Path, config: IngestConfig | None 
     """
     config = _settings(config, "source_fingerprint")
     source = source if isinstance(source, Source) else resolve(source)
-    found = _dataset(source).fingerprint(source, config)
+    with _permission_named():
+        found = _dataset(source).fingerprint(source, config)
     if config.stereo_camera != "left":
         found = {**found, "stereo_camera": config.stereo_camera}
     if config.calibration is None:
@@ -206,6 +212,15 @@ def source_fingerprint(source: Source | str | Path, config: IngestConfig | None 
         raise SourceNotFoundError("no such calibration file", file=file, field="ingest.calibration")
     told = {"calibration": file_digests([("calibration", file)]), "calibration_version": CALIBRATION_VERSION}
     return found | told
+
+
+@contextmanager
+def _permission_named() -> Iterator[None]:
+    """What this user may not read is wrong with its source, not with the program."""
+    try:
+        yield
+    except PermissionError as error:
+        raise SourceError(f"it cannot be read: {error.strerror}", file=error.filename) from error
 
 
 def _settings(config: IngestConfig | None, function: str) -> IngestConfig:

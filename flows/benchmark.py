@@ -45,7 +45,7 @@ from flows.wiring import run_sequence
 from tasks.evaluate import METRICS_FILE
 from tasks.run_page import artifact_key, attempt
 
-__all__ = ["Case", "benchmark", "case_of", "check_methods", "run_method"]
+__all__ = ["Case", "benchmark", "case_of", "check_methods", "check_repetitions", "run_method"]
 
 log = logging.getLogger(__name__)
 
@@ -126,8 +126,8 @@ def benchmark(
         `comparison.json`.
 
     Raises:
-        ConfigError: for an unknown method or baseline, a setting that is wrong, or a tolerance for what is
-            not measured anew.
+        ConfigError: for an unknown method or baseline, a profile or seed that is given twice, a setting that
+            is wrong, or a tolerance for what is not measured anew.
         BenchmarkRegressedError: when it is worse than the runs before by more than `tolerance`; page, tables
             and history have been written by then.
         ExtragsError: when a model, weights or a package that the settings name is not there.
@@ -135,6 +135,7 @@ def benchmark(
     if tolerance is not None and not refresh:
         raise ConfigError("a tolerance needs refresh: what is taken from the store is as good as it was")
     baseline = check_methods(methods, variants or {}, baseline)
+    check_repetitions(profiles, seeds)
     store = run_store(store)
     chosen = [
         replace(item, settings={**(settings or {}), **item.settings}) for item in chosen_sequences(sequences)
@@ -320,6 +321,17 @@ def check_methods(
     if baseline not in wanted:
         raise ConfigError(f"the baseline {baseline!r} is not among the methods: {', '.join(wanted)}")
     return baseline
+
+
+def check_repetitions(profiles: Sequence[str], seeds: Sequence[int]) -> None:
+    """Check that no run would be there twice, which the comparison at the end refuses.
+
+    Raises:
+        ConfigError: for a profile or seed that is given twice.
+    """
+    for what, values in (("profile", profiles), ("seed", seeds)):
+        if len(set(values)) < len(values):
+            raise ConfigError(f"a {what} is given twice: {', '.join(map(str, values))}")
 
 
 def summary_of(method: str, variants: dict[str, dict[str, Any]]) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
-from data_catalog.names import plain_name
+from data_catalog.names import path_of, plain_name
 from extrags.config import PipelineConfig
 from extrags.errors import ArtefactGoneError, DamagedArtefactError, ExtragsError
 from extrags.pipeline import Pipeline
@@ -77,7 +77,8 @@ class CachedStages(Pipeline):
             if isinstance(self.runner, StoreRunner):
                 self._attempt(until)  # Who only looks moves nothing.
             else:
-                with recorded_run(self.store, self.outcome.name, digest_of(self._given)) as self._record:
+                name, config = self.outcome.name, digest_of(self._given)
+                with recorded_run(self.store, name, config, path_of(name) or "") as self._record:
                     again_after_damage(self.store, lambda: self._attempt(until))
         except (_StoppedError, ArtefactGoneError, DamagedArtefactError) as error:
             if not isinstance(error, _StoppedError):

@@ -21,13 +21,13 @@ from flows.damage import again_after_damage
 from flows.expectation import Expectation, expectations, expected_words, longest_first
 from flows.leases import run_lease
 from flows.limits import DEFAULT_LIMITS, StageLimits
-from flows.methods import METHODS, MethodName, profile_label
+from flows.methods import MethodName, profile_label
 from flows.outcome import DatasetFailedError, DatasetOutcome, SequenceFailedError, SequenceOutcome, StageRow
 from flows.pages import dataset_page
 from flows.parameters import Matrix, Sequences, Settings, StoreRoot
-from flows.preflight import preflight
+from flows.preflight import preflight_cases
 from flows.run_page import run_page
-from flows.runners import PrefectRunner
+from flows.runners import PrefectRunner, refreshed_once
 from flows.selection import chosen_sequences
 from flows.sequence import open_store, reconstruct_sequence
 from flows.settings import run_store, task_runner
@@ -151,6 +151,8 @@ def reconstruct_dataset(
     with (
         run_lease(store),
         run_page(name, config, until, sequences=len(cases), bars=False, work=work) as page,
+        # Also where all are looked up again, since the page of all met damage.
+        refreshed_once(),
     ):
         found = again_after_damage(Store(store), run_all)
         if found.report is not None:
@@ -171,12 +173,10 @@ def _check(cases: Sequence[SequenceCase], store: str, until: StageName) -> None:
     """Report what affects all sequences once: invalid settings, missing models and a read-only store.
 
     Raises:
-        ExtragsError: see `flows.sequence.open_store` and `flows.preflight.preflight`.
+        ExtragsError: see `flows.sequence.open_store` and `flows.preflight.preflight_cases`.
     """
     open_store(store)
-    for method in dict.fromkeys(case.method for case in cases):
-        first = next(case for case in cases if case.method == method)
-        preflight(first.config(), until, METHODS[method].leave_out)
+    preflight_cases(cases, until)
 
 
 def _side_by_side(

@@ -156,8 +156,18 @@ def _declared(entry: Any, file: Path) -> Declared:
         raise ConfigError(f"{file}: a deployment needs a name and an entrypoint")
     place = f"{file}: deployment {entry['name']}"
     schedules = entry.get("schedules") or [{}]
-    if len(schedules) > 1 or not set(schedules[0]) <= {"cron", "timezone", "active"}:
+    if (
+        not isinstance(schedules, list)
+        or len(schedules) > 1
+        or not isinstance(schedules[0], dict)
+        or not set(schedules[0]) <= {"cron", "timezone", "active"}
+    ):
         raise ConfigError(f"{place}: expected one schedule at most, with cron and timezone")
+    if entry.get("schedules") and not isinstance(schedules[0].get("cron"), str):
+        raise ConfigError(f'{place}: schedules: expected cron as a text, e.g. "0 2 * * *"')
+    tags = entry.get("tags") or []
+    if not isinstance(tags, list):
+        raise ConfigError(f"{place}: tags: expected a list")
     limit = entry.get("concurrency_limit")
     limit = limit if isinstance(limit, dict) else {"limit": limit}
     variables = _fields(_fields(entry, "work_pool", place), "job_variables", place)
@@ -169,10 +179,10 @@ def _declared(entry: Any, file: Path) -> Declared:
         entrypoint=entry["entrypoint"],
         parameters=_fields(entry, "parameters", place),
         cron=schedules[0].get("cron"),
-        timezone=schedules[0].get("timezone", "UTC"),
+        timezone=schedules[0].get("timezone") or "UTC",
         concurrency_limit={name: value for name, value in limit.items() if value is not None},
         description=entry.get("description", ""),
-        tags=tuple(entry.get("tags") or ()),
+        tags=tuple(map(str, tags)),
         environment={name: str(value) for name, value in _fields(variables, "env", place).items()},
         # `prefect deploy` writes fields without a value.
         unserved=tuple(name for name, value in others.items() if value not in (None, "", [], {})),

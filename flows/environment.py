@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,7 +20,7 @@ def has_own_home() -> bool:
     return not os.environ.get("PREFECT_API_URL") and not os.environ.get("PREFECT_HOME")
 
 
-def prepare(state: Path, *, debug: bool = False) -> None:
+def prepare(state: Path, *, debug: bool = False, looks: bool = False) -> None:
     """Set up a separate Prefect home with quiet logging; variables set by the user are kept.
 
     OpenMP threads are set to wait passively: active waiting, their default, makes training up to five times
@@ -29,6 +30,8 @@ def prepare(state: Path, *, debug: bool = False) -> None:
         state: local directory of the store; Prefect's database goes to `prefect/` in it. Left alone when
             PREFECT_HOME or PREFECT_API_URL is set: then runs land where the user wants them.
         debug: let Prefect log.
+        looks: for what may find all it needs in the store, which somebody else may have filled and which
+            cannot be written then: Prefect's home may be missing.
 
     Raises:
         StoreError: when the directory cannot be made.
@@ -54,7 +57,10 @@ def prepare(state: Path, *, debug: bool = False) -> None:
         try:
             home.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise StoreError(f"the store {state} cannot be written: {error.strerror or error}") from error
+            if not looks:
+                raise StoreError(f"the store {state} cannot be written: {error.strerror or error}") from error
+            # Prefect would say so at its import.
+            warnings.filterwarnings("ignore", message="Failed to create the Prefect home directory")
         # Nobody looks at the page of a run on a server that goes with it.
         chosen["PREFECT_LOGGING_TO_API_ENABLED"] = "false"
         chosen[PAGE_VARIABLE] = "0"

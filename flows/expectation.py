@@ -174,5 +174,6 @@ def _work(
             return Workload(config=config, **size), STAGES
     try:
         return work_before_reading(sequence, config, ())
-    except ExtragsError:
+    except (ExtragsError, OSError):
+        # One source that cannot be read, or whose disk has gone, must not stop the others.
         return None, STAGES

@@ -107,9 +107,13 @@ def run_lease(root: str) -> Iterator[None]:
         yield
     finally:
         if descriptor is not None:
-            # Removed while it is still locked: nobody finds it free.
-            (folder / _name(context.flow_run)).unlink(missing_ok=True)
-            os.close(descriptor)
+            try:
+                # Removed while it is still locked: nobody finds it free.
+                (folder / _name(context.flow_run)).unlink(missing_ok=True)
+            except OSError as error:
+                log.warning("the lease of this run stays: %s", error)
+            finally:
+                os.close(descriptor)
 
 
 def settle_dead_runs(root: str, suspects: frozenset[UUID] = frozenset()) -> tuple[list[FlowRun], set[UUID]]:

@@ -55,7 +55,10 @@ class StageLimits(BaseModel):
         5.0, ge=0, le=3600, description="before the second try; doubled after each, and spread at random"
     )
     time_limit_s: float | None = Field(
-        None, gt=0, description="a stage fails at its first progress event after so long; no limit by default"
+        None,
+        gt=0,
+        description="a stage fails at the first progress event after so long, each of its tasks for "
+        "itself; no limit by default",
     )
     memory_gb: float | None = Field(
         None,

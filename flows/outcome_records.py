@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from data_catalog.names import comparable_name
@@ -19,6 +19,7 @@ __all__ = [
     "recorded_page",
     "report_key",
     "setting_text",
+    "told_apart",
 ]
 
 OUTCOME = "outcome."
@@ -51,6 +52,17 @@ def recorded_name(record: OutcomeRecord) -> str:
     A relative path of an earlier version's record is taken from where this is asked.
     """
     return str(record.get("path") or comparable_name(str(record["sequence"])))
+
+
+def told_apart(records: Sequence[OutcomeRecord]) -> list[str]:
+    """The name of each record's sequence: its path where relative ones of several places are the same."""
+    places: dict[str, set[str]] = {}
+    for record in records:
+        places.setdefault(str(record["sequence"]), set()).add(recorded_name(record))
+    return [
+        recorded_name(record) if len(places[str(record["sequence"])]) > 1 else str(record["sequence"])
+        for record in records
+    ]
 
 
 def record_of(records: Mapping[str, OutcomeRecord], name: str, former_name: str) -> OutcomeRecord | None:

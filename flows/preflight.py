@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from extrags.config import PipelineConfig
-from extrags.errors import WeightsError
+from extrags.errors import ExtragsError, WeightsError
 from extrags.metrics.registry import added_metrics
 from extrags.stages import stages_until
+from extrags.store import digest_of
 from extrags.user_paths import expanded
 
-__all__ = ["preflight"]
+if TYPE_CHECKING:
+    from flows.cases import SequenceCase
+
+__all__ = ["preflight", "preflight_cases"]
 
 log = logging.getLogger(__name__)
 
@@ -92,6 +97,38 @@ def preflight(config: PipelineConfig, until: str, leave_out: Collection[str] = (
         from extrags.restoration import check_restorer
 
         check_restorer(config.enhance)
+
+
+def preflight_cases(cases: Sequence[SequenceCase], until: str) -> None:
+    """Check what the runs of a dataset need, before the first of them.
+
+    What is missing for some alone, whose settings a manifest gives, is said by their own runs: these stop no
+    other.
+
+    Args:
+        cases: all runs.
+        until: last stage to run.
+
+    Raises:
+        ExtragsError: as `preflight`, where a method has no case that could run; of the first.
+    """
+    from flows.methods import METHODS
+
+    for method in dict.fromkeys(case.method for case in cases):
+        unlike = {
+            digest_of([dict(case.settings), dict(case.changed)]): case
+            for case in reversed(cases)
+            if case.method == method
+        }
+        refused: list[ExtragsError] = []
+        for case in reversed(unlike.values()):
+            try:
+                preflight(case.config(), until, METHODS[method].leave_out)
+                break
+            except ExtragsError as error:
+                refused.append(error)
+        else:
+            raise refused[0]
 
 
 @cache

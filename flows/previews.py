@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from extrags.output_files import whole_file
 from extrags.store import Ref, Store
 from flows.outcome import SequenceOutcome
+from tasks.run_page import plain_letters
 
 if TYPE_CHECKING:
     import numpy as np
@@ -71,7 +71,7 @@ def stage_preview(label: str, stage: str, made: Mapping[str, Ref], store: Store)
 
     folder = store.state / "previews"
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"{re.sub(r'[^A-Za-z0-9@.]+', '-', label).strip('-')}.jpg"
+    path = folder / f"{plain_letters(label, 'A-Za-z0-9@.')}.jpg"
     with whole_file(path) as unfinished:
         Image.fromarray(strip).save(unfinished, format="JPEG", quality=90)
     return path, words

@@ -25,6 +25,7 @@ from flows.outcome_records import (
     recorded_page,
     report_key,
     setting_text,
+    told_apart,
 )
 
 if TYPE_CHECKING:
@@ -238,9 +239,9 @@ def last_runs(
         StoreError: when the store cannot be read.
     """
     found: dict[str, RecordedRun] = {}
-    for record in sorted(outcome_records(store).values(), key=lambda item: str(item["ended"])):
-        sequence = str(record["sequence"])
-        if not _matches(sequence, patterns):
+    records = sorted(outcome_records(store).values(), key=lambda item: str(item["ended"]))
+    for record, sequence in zip(records, told_apart(records), strict=True):
+        if not (_matches(sequence, patterns) or _matches(str(record["sequence"]), patterns)):
             continue
         key = _key_of(record) if record["status"] == "ok" and _wanted(record, methods, profiles, ()) else None
         manifest = None if key is None else _manifest(store, key)
@@ -316,9 +317,9 @@ def board_rows(store: Store, patterns: Sequence[str] = (), target: str = "") -> 
     """
     rows = []
     there = set(store.keys())
-    for record in outcome_records(store).values():
-        sequence = str(record["sequence"])
-        if not _matches(sequence, patterns):
+    records = list(outcome_records(store).values())
+    for record, sequence in zip(records, told_apart(records), strict=True):
+        if not (_matches(sequence, patterns) or _matches(str(record["sequence"]), patterns)):
             continue
         seed, tree = record["seed"], record["metrics"]
         page = recorded_page(store, record, there)

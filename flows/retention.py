@@ -56,6 +56,9 @@ def retention(
         int | None, Field(ge=1, description="of each sequence, keep what its last runs used")
     ] = None,
     unreachable: Annotated[bool, Field(description="remove what no kept run used")] = False,
+    with_inputs: Annotated[
+        bool, Field(description="also what kept artefacts were made from, except by max_gib")
+    ] = False,
     flow_runs_days: Annotated[
         float | None, Field(gt=0, description="delete flow runs of extrags that ended so long ago")
     ] = None,
@@ -84,6 +87,7 @@ def retention(
             keep_last=keep_last,
             unreachable=unreachable,
             versions=all_stage_versions(),
+            with_inputs=with_inputs,
         )
         removed = planned_removals(place, policy)[0] if dry_run else apply_policy(place, policy)
         for item in removed:

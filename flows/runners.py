@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, Literal, Protocol
@@ -34,6 +35,7 @@ __all__ = [
     "Runner",
     "StoreRunner",
     "WorkerLostError",
+    "refreshed_once",
 ]
 
 log = logging.getLogger(__name__)
@@ -79,6 +81,24 @@ class Runner(Protocol):
         ...
 
 
+_shared: ContextVar[set[str] | None] = ContextVar("extrags_refreshed", default=None)
+
+
+def _known_as_refreshed() -> set[str]:
+    shared = _shared.get()
+    return set() if shared is None else shared
+
+
+@contextmanager
+def refreshed_once() -> Iterator[None]:
+    """What one of the runners that are made inside the block has made anew, no other one makes anew."""
+    token = _shared.set(set())
+    try:
+        yield
+    finally:
+        _shared.reset(token)
+
+
 @dataclass(frozen=True)
 class PrefectRunner:
     """Task runs of the current flow, on its task runner.
@@ -86,14 +106,14 @@ class PrefectRunner:
     Args:
         store: root of the store.
         refresh: run stages although their artefacts are there; each once, also where several runs that go
-            through this runner share it.
+            through this runner share it, or through others inside a block (`refreshed_once`).
         limits: retries and time limits of each task.
     """
 
     store: str
     refresh: bool = False
     limits: StageLimits = field(default_factory=StageLimits)
-    _refreshed: set[str] = field(default_factory=set, repr=False, compare=False)
+    _refreshed: set[str] = field(default_factory=_known_as_refreshed, repr=False, compare=False)
     """Keys of what this runner has made anew."""
 
     def run(self, calls: Sequence[Call], label: str) -> list[Result]:

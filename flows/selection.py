@@ -51,14 +51,15 @@ def chosen_sequences(given: Sequence[str]) -> list[Chosen]:
             `sequences` beside `settings` for all of them.
 
     Raises:
-        ConfigError: for a manifest that cannot be read, one sequence with different settings, or a name
-            that stands there twice.
+        ConfigError: for a manifest that cannot be read, one sequence with different settings, a name that
+            stands there twice, or one that is no UTF-8.
         UnknownSequenceError: for a pattern that matches nothing.
         SourceNotFoundError: for a pattern whose sequences are all elsewhere.
     """
     found: dict[str, Chosen] = {}
     literal: set[str] = set()
     for item in _without_manifests(given):
+        _check_is_text(item.name)
         names: Sequence[str] = [plain_name(item.name)]
         if is_pattern(item.name):
             names, elsewhere = matching_names(item.name)
@@ -81,6 +82,21 @@ def chosen_sequences(given: Sequence[str]) -> list[Chosen]:
     if not found:
         raise ConfigError(f"no sequence is named in {', '.join(given) or 'an empty list'}")
     return list(found.values())
+
+
+def _check_is_text(name: str) -> None:
+    """Refuse what Python takes the bytes of a path for that are no UTF-8.
+
+    Manifests, pages and Prefect's parameters hold text: the run would end at the first of them.
+    """
+    try:
+        name.encode()
+    except UnicodeEncodeError as error:
+        # Messages are text as well.
+        shown = name.encode(errors="backslashreplace").decode()
+        raise ConfigError(
+            f"the name {shown} is no UTF-8, as artefacts and pages are; rename the folder or file"
+        ) from error
 
 
 def absolute_manifests(given: Sequence[str]) -> list[str]:

@@ -15,7 +15,14 @@ from extrags.stages import STAGES, all_tasks, stage_of_task, stages_until
 from extrags.store import Manifest, Store, in_work
 from extrags.store.manifest import stage_of
 from extrags.store.runs import Run, active_runs, runs_of
-from flows.outcome_records import OutcomeRecord, outcome_records, recorded_name, recorded_page, setting_text
+from flows.outcome_records import (
+    OutcomeRecord,
+    outcome_records,
+    recorded_name,
+    recorded_page,
+    setting_text,
+    told_apart,
+)
 from flows.selection import chosen_sequences
 
 __all__ = ["StageStatus", "StatusRow", "StoreStatus", "store_status"]
@@ -164,7 +171,7 @@ def store_status(store: Store, patterns: Sequence[str] = ()) -> StoreStatus:
         StoreError: when the store cannot be read.
     """
     found = list(outcome_records(store).values())
-    shown_as = _told_apart(found)
+    shown_as = told_apart(found)
     places = {name: recorded_name(record) for record, name in zip(found, shown_as, strict=True)}
     labels = {str(record["sequence"]) for record in found}
     keys = store.keys()
@@ -211,17 +218,6 @@ def store_status(store: Store, patterns: Sequence[str] = ()) -> StoreStatus:
     # Pages of several sequences are of no one run.
     unrecorded = sum(key not in recorded and _stage_of(stage_of(key)) in STAGES for key in keys)
     return StoreStatus(store.root, rows, len(keys), sum(bytes_of.values()), unrecorded, counts)
-
-
-def _told_apart(records: Sequence[OutcomeRecord]) -> list[str]:
-    """The name of each record's sequence: its path where relative ones of several places are the same."""
-    places: dict[str, set[str]] = {}
-    for record in records:
-        places.setdefault(str(record["sequence"]), set()).add(recorded_name(record))
-    return [
-        recorded_name(record) if len(places[str(record["sequence"])]) > 1 else str(record["sequence"])
-        for record in records
-    ]
 
 
 def _unfinished(store: Store, going_on: Sequence[Run], ended: set[str]) -> dict[str, Run]:

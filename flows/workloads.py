@@ -34,7 +34,7 @@ def known_work(name: str, config: PipelineConfig) -> Workload | None:
     """That of a sequence as far as the catalogue tells; None for a path."""
     try:
         return _catalogue_work(describe(name), config)
-    except ExtragsError:
+    except (ExtragsError, OSError):
         return None
 
 
@@ -42,7 +42,8 @@ def expected_work(name: str, config: PipelineConfig) -> Workload | None:
     """That of a sequence as far as can be told before it is read; None where it cannot be."""
     try:
         return work_before_reading(name, config, ())[0]
-    except ExtragsError:
+    except (ExtragsError, OSError):
+        # What is wrong with a source, or with the disk it is on, is said by its own run.
         return None
 
 

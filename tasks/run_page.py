@@ -23,6 +23,7 @@ from uuid import UUID
 from prefect.artifacts import create_progress_artifact, update_progress_artifact
 from prefect.context import FlowRunContext, TaskRunContext
 
+from extrags.store import digest_of
 from tasks.page_choice import page_chosen
 from tasks.progress import (
     Pace,
@@ -39,6 +40,7 @@ __all__ = [
     "artifact_key",
     "attempt",
     "page_wanted",
+    "plain_letters",
     "stage_page",
 ]
 
@@ -64,8 +66,21 @@ def page_wanted() -> bool:
 
 def artifact_key(kind: str, *names: str) -> str:
     """A key as Prefect wants it: lower-case letters, digits and dashes."""
-    plain = (re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-") for name in (kind, *names))
+    plain = (plain_letters(name.lower(), "a-z0-9") for name in (kind, *names))
     return "-".join(word for word in plain if word)
+
+
+def plain_letters(name: str, allowed: str) -> str:
+    """A name of these characters alone, with dashes for all others.
+
+    Letters of other scripts tell names apart: a digest stands for them.
+
+    Args:
+        name: of a sequence, a stage or a run.
+        allowed: what may stand between the brackets of a regular expression.
+    """
+    plain = re.sub(rf"[^{allowed}]+", "-", name).strip("-")
+    return plain if name.isascii() else f"{plain}-{digest_of(name)[:8]}".strip("-")
 
 
 def attempt(make: Callable[[], object]) -> bool:

@@ -45,10 +45,22 @@ class Weights(BaseModel):
         return PerceptualDifference(self.lpips(), self.reason)
 
     def lpips(self) -> Lpips | None:
-        """LPIPS with these weights; None without."""
+        """LPIPS with these weights; None without.
+
+        Raises:
+            WeightsError: when the files are others than those that the key of an artefact stands for.
+        """
         from extrags.metrics.lpips import Lpips
 
-        return Lpips.read(tuple(map(Path, self.paths)), self.net) if self.paths else None
+        if not self.paths:
+            return None
+        files = tuple(map(Path, self.paths))
+        if not all(file.is_file() for file in files) or _content_digest(files) != self.digest:
+            raise WeightsError(
+                f"the weights of LPIPS with {self.net} in {', '.join(self.paths)} are not those this run "
+                "began with: they changed meanwhile, or this worker sees other files; run again"
+            )
+        return Lpips.read(files, self.net)
 
 
 def lpips_weights(config: EvaluateConfig) -> list[Weights]:
@@ -68,14 +80,17 @@ def lpips_weights(config: EvaluateConfig) -> list[Weights]:
                 raise
             found.append(Weights(net=net, reason=str(error)))
             continue
-        digest = _digest(tuple((file, file.stat().st_size, file.stat().st_mtime_ns) for file in files))
-        found.append(Weights(net=net, paths=tuple(map(str, files)), digest=digest))
+        found.append(Weights(net=net, paths=tuple(map(str, files)), digest=_content_digest(files)))
     return found
 
 
 def lpips_by_net(weights: Sequence[Weights]) -> dict[LpipsNet, Lpips | str]:
     """LPIPS by backbone: the metric with its weights, or the reason why there are none."""
     return {item.net: item.lpips() or item.reason for item in weights}
+
+
+def _content_digest(files: Sequence[Path]) -> str:
+    return _digest(tuple((file, file.stat().st_size, file.stat().st_mtime_ns) for file in files))
 
 
 @lru_cache(maxsize=8)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import datetime
+import errno
 import json
 import logging
 import shutil
+import stat
 import time
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -19,7 +21,7 @@ from extrags.store.canonical import Ref
 from extrags.store.directory import ABOUT, DirectoryBackend, private_directory, sweep_directories
 from extrags.store.integrity import Damage, Depth, default_depth, find_damage, list_contents
 from extrags.store.kept import kept_or_read
-from extrags.store.manifest import Manifest, is_name, software_versions, stage_of
+from extrags.store.manifest import MANIFEST, Manifest, is_name, software_versions, stage_of
 from extrags.store.refusal import refused_write
 from extrags.store.slot import Slot
 from extrags.store.storable import Storable
@@ -251,8 +253,8 @@ class Store:
         """
         try:
             manifest = self.backend.read_manifest(_checked(key))
-        except DamagedArtefactError as error:
-            return error
+        except StoreError as error:
+            return _as_damage(error, key, self.root)
         damage = None if manifest is None else self.backend.examine(manifest)
         return None if damage is None else self._damaged(key, damage)
 
@@ -355,6 +357,7 @@ class Store:
                 slot.path.mkdir()
                 with self._blaming(slot._inputs.values()):
                     yield slot
+                _share(slot.path, like=scratch / ABOUT)
                 listing = list_contents(slot.path, slot.run_files)
                 slot._manifest = self.backend.commit(
                     slot.path,
@@ -409,6 +412,9 @@ class Store:
         """Manifests of the artefacts whose key, stage or label matches a shell pattern, by stage and age.
 
         Those with a damaged manifest are left out, with a warning.
+
+        Raises:
+            StoreError: when the store cannot be read.
         """
         manifests = [self._readable_manifest(key) for key in self.backend.names()]
         chosen = [
@@ -421,8 +427,8 @@ class Store:
     def _readable_manifest(self, key: str) -> Manifest | None:
         try:
             return self.backend.read_manifest(key)
-        except DamagedArtefactError as error:
-            log.warning("%s", error)
+        except StoreError as error:
+            log.warning("%s", _as_damage(error, key, self.root))
             return None
 
     def rm(self, pattern: str) -> list[str]:
@@ -434,7 +440,8 @@ class Store:
         for key in self.backend.names():
             try:
                 manifest = self.backend.read_manifest(key)
-            except DamagedArtefactError:
+            except StoreError as error:
+                _as_damage(error, key, self.root)
                 about, started = [stage_of(key)], ""
             else:
                 if manifest is None:
@@ -474,10 +481,50 @@ class Store:
         removed = self.backend.sweep(older_than_hours, dry_run=dry_run)
         failures = self.state / "failed"
         if failures.is_dir():
-            removed += [f"failed/{entry.name}" for entry in sorted(failures.iterdir())]
-            if not dry_run:
-                shutil.rmtree(failures)
+            for entry in sorted(failures.iterdir()):
+                removed.append(f"failed/{entry.name}")
+                if not dry_run:
+                    # Another machine may clean the same store at the same hour.
+                    with suppress(FileNotFoundError):
+                        shutil.rmtree(entry)
         return removed + self.backend.remove_damaged(dry_run=dry_run)
+
+
+def _as_damage(error: StoreError, key: str, root: str) -> DamagedArtefactError:
+    """What is wrong with an artefact whose manifest could not be read.
+
+    A disk that does not give it back has damaged it, for who looks through the whole store; who needs it
+    tries again first (`flows.limits`). Object stores answer so when they are busy.
+
+    Raises:
+        StoreError: the error itself, where it tells nothing of this artefact.
+    """
+    if isinstance(error, DamagedArtefactError):
+        return error
+    cause = error.__cause__
+    if "://" in root or not isinstance(cause, OSError) or cause.errno != errno.EIO:
+        raise error
+    problem = f"cannot be read: {cause.strerror}"
+    return DamagedArtefactError(problem, file=MANIFEST, stage=stage_of(key), key=key, store=root)
+
+
+def _share(directory: Path, *, like: Path) -> None:
+    """Give the files of an artefact at least the permissions that a new file has here.
+
+    Some writers make files that their owner alone may read, whatever the umask says: other users of the store
+    could not use them.
+
+    Args:
+        directory: the files.
+        like: a file that was written in the usual way.
+    """
+    usual = stat.S_IMODE(like.stat().st_mode)
+    for path in directory.rglob("*"):
+        mode = path.lstat().st_mode
+        if stat.S_ISREG(mode) and usual & ~mode:
+            # Where a file system has no permissions, nobody is refused.
+            with suppress(OSError):
+                path.chmod(stat.S_IMODE(mode) | usual)
 
 
 def _matches(pattern: str, *names: str) -> bool:

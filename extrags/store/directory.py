@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import json
 import os
@@ -152,21 +153,26 @@ class DirectoryBackend:
         try:
             (self.artefacts / key).rename(place / "artefact")
         except FileNotFoundError:
-            shutil.rmtree(place)
+            # The artefact is gone, or this place is, removed by who cleans the store: then it stays where it
+            # is, to be replaced.
+            shutil.rmtree(place, ignore_errors=True)
             return None
         return str(place)
 
     def remove_damaged(self, *, dry_run: bool = False) -> list[str]:
         """Remove what was set aside; returns the names."""
         place = self.root / DAMAGED
-        names = [f"{DAMAGED}/{name}" for name in sorted(os.listdir(place))] if place.is_dir() else []
-        if not dry_run:
-            shutil.rmtree(place, ignore_errors=True)
-        return names
+        names = sorted(os.listdir(place)) if place.is_dir() else []
+        # One by one: what is set aside meanwhile stays.
+        for name in [] if dry_run else names:
+            shutil.rmtree(place / name, ignore_errors=True)
+        return [f"{DAMAGED}/{name}" for name in names]
 
     def write_record(self, name: str, text: bytes) -> None:
         """Write `records/<name>`; one that is there is replaced at once, never half."""
-        self._put(self.root / RECORDS / name, text)
+        target = self.root / RECORDS / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        self._put(target, text)
 
     def read_records(self, prefix: str) -> dict[str, bytes]:
         """Records by name, of those whose name begins so."""
@@ -181,6 +187,10 @@ class DirectoryBackend:
                 found[name] = (place / name).read_bytes()
             except FileNotFoundError:
                 continue  # Removed meanwhile.
+            except OSError as error:
+                if error.errno != errno.EIO:
+                    raise
+                found[name] = b""  # The disk does not give it back: it is damaged, and the others are not.
         return found
 
     def remove_record(self, name: str) -> None:
@@ -188,7 +198,6 @@ class DirectoryBackend:
         (self.root / RECORDS / name).unlink(missing_ok=True)
 
     def _put(self, target: Path, text: bytes) -> None:
-        target.parent.mkdir(parents=True, exist_ok=True)
         with private_directory(self.scratch, target.name) as private:
             (private / "written").write_bytes(text)
             (private / "written").replace(target)
@@ -223,7 +232,10 @@ class DirectoryBackend:
                 if present is not None and same_content(present, manifest):
                     if not renew:
                         return present
-                    self._put(target / MANIFEST, manifest_text(manifest))
+                    try:
+                        self._put(target / MANIFEST, manifest_text(manifest))
+                    except FileNotFoundError:
+                        continue  # Removed meanwhile: then this one takes its place.
                     return manifest
                 if not target.exists():
                     raise

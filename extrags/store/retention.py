@@ -14,6 +14,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
+from extrags.errors import StoreError
 from extrags.stages import PAGES_OF_SEVERAL, all_tasks
 from extrags.store.artefacts import Store
 from extrags.store.manifest import Manifest, stage_of
@@ -77,7 +78,7 @@ class SequenceUsage:
         files: number, manifests among them.
         bytes: of all files but manifests.
         made: the latest, UTC, ISO 8601.
-        used: the latest; on object stores, when it was made.
+        used: the latest; on object stores, when it was made, or a run on record ended that used it.
     """
 
     sequence: str
@@ -89,12 +90,24 @@ class SequenceUsage:
 
 
 class _Contents:
-    """The artefacts of a store, what they were made from, and when they were used last."""
+    """The artefacts of a store, what they were made from, and when they were used last.
 
-    def __init__(self, store: Store) -> None:
+    Where a store keeps no time of use, as object stores, the records of runs tell.
+
+    Args:
+        store: which.
+        runs: that ended.
+    """
+
+    def __init__(self, store: Store, runs: Iterable[Run]) -> None:
         self.manifests = {manifest.key: manifest for manifest in store.ls()}
         used = store.backend.last_used(self.manifests)
         self.used = {key: used.get(key, _made(item)) for key, item in self.manifests.items()}
+        for run in runs:
+            ended = _moment(run.ended)
+            for key in run.keys & self.used.keys():
+                if key not in used:
+                    self.used[key] = max(self.used[key], ended)
 
     def with_inputs(self, keys: Iterable[str]) -> set[str]:
         """Artefacts, and all those they were made from."""
@@ -133,13 +146,21 @@ def planned_removals(
         The artefacts in the order of their removal, what was made from others before these; and the runs
         whose records go with them.
     """
-    return _planned(store, policy, _Contents(store), time.time() if now is None else now)
+    return _planned(policy, *_looked_over(store), time.time() if now is None else now)
+
+
+def _looked_over(store: Store) -> tuple[_Contents, list[Run], list[Run]]:
+    """What there is, the runs that ended, and those that are going on."""
+    # Before and after: one that ends meanwhile is among the others, and one may begin.
+    going_on = active_runs(store)
+    runs = runs_of(store)
+    contents = _Contents(store, runs)
+    return contents, runs, [*going_on, *active_runs(store)]
 
 
 def _planned(
-    store: Store, policy: Policy, contents: _Contents, now: float
+    policy: Policy, contents: _Contents, runs: list[Run], going_on: list[Run], now: float
 ) -> tuple[list[Removal], list[Run]]:
-    runs, going_on = runs_of(store), active_runs(store)
     runs = [replace(run, ended=max(run.ended, _last_time(run, contents))) for run in runs]
     kept_runs, former = _last_runs(_with_pages(runs, contents), policy.keep_last)
     of_kept = {key for run in kept_runs for key in run.keys}
@@ -182,26 +203,44 @@ def _planned(
 
 
 def apply_policy(store: Store, policy: Policy) -> list[Removal]:
-    """Remove what a policy does not keep; returns what was removed."""
-    contents = _Contents(store)
-    plan, gone = _planned(store, policy, contents, time.time())
+    """Remove what a policy does not keep; returns what was removed.
+
+    What cannot be removed, as an artefact of another user, stays with what it was made from, and hinders no
+    other.
+
+    Raises:
+        StoreError: when something could not be removed; all else has been by then.
+    """
+    contents, runs, going_on = _looked_over(store)
+    plan, gone = _planned(policy, contents, runs, going_on, time.time())
     removed = []
     spared: set[str] = set()
+    refused: dict[str, StoreError] = {}
     for item in plan:
         # A run may have begun to use it since; then it needs what that was made from.
         if item.key not in spared:
             used = store.backend.last_used([item.key]).get(item.key, 0.0)
             if used > time.time() - MOMENT_S:
                 spared |= contents.with_inputs([item.key])
-            elif store.backend.discard(item.key):
-                removed.append(item)
-    forget(store, gone)
+                continue
+            try:
+                if store.backend.discard(item.key):
+                    removed.append(item)
+            except StoreError as error:
+                refused[item.key] = error
+                spared |= contents.with_inputs([item.key])
+    forget(store, [run for run in gone if not run.keys & refused.keys()])
+    if refused:
+        first = next(iter(refused.values()))
+        raise StoreError(
+            f"{len(refused)} of {len(removed) + len(refused)} artefacts could not be removed: {first}"
+        ) from first
     return removed
 
 
 def usage(store: Store) -> list[SequenceUsage]:
     """What each sequence uses, the largest first."""
-    contents = _Contents(store)
+    contents = _Contents(store, runs_of(store))
     by_sequence: dict[str, list[Manifest]] = defaultdict(list)
     for item in contents.manifests.values():
         by_sequence[item.label].append(item)
@@ -257,7 +296,8 @@ def _last_runs(runs: list[Run], count: int | None) -> tuple[list[Run], list[Run]
         return runs, []
     by_sequence: dict[str, list[Run]] = defaultdict(list)
     for run in runs:
-        by_sequence[run.sequence].append(run)
+        # Relative names of several places may be the same.
+        by_sequence[run.place or run.sequence].append(run)
     kept = []
     for each in by_sequence.values():
         # Of those that used the same the last one stands for all.
@@ -285,10 +325,16 @@ def _is_intermediate(key: str) -> bool:
 
 
 def _made(manifest: Manifest) -> float:
+    started = _moment(manifest.started)
+    return started + manifest.seconds if started else 0.0  # The first manifests had no date.
+
+
+def _moment(text: str) -> float:
+    """Seconds since 1970 of a date; 0 of none."""
     try:
-        return datetime.datetime.fromisoformat(manifest.started).timestamp() + manifest.seconds
+        return datetime.datetime.fromisoformat(text).timestamp()
     except ValueError:
-        return 0.0  # The first manifests had no date.
+        return 0.0
 
 
 def _date(moment: float) -> str:

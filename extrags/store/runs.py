@@ -14,6 +14,7 @@ import logging
 import os
 import secrets
 import threading
+import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -28,6 +29,8 @@ __all__ = ["Run", "RunRecord", "active_runs", "file_killed", "forget", "recorded
 log = logging.getLogger(__name__)
 
 _PREFIX = "run-"
+_LOOKS, _BETWEEN_LOOKS_S = 20, 0.05
+"""How often a record that is half written is read again."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +45,8 @@ class Run:
         interrupted: whether it was told to stop or was killed before its end; records of earlier versions do
             not tell.
         config: digest of its settings; empty where it is not known.
+        place: absolute path of a sequence that is named by a relative one; empty for others, and in records
+            of earlier versions.
     """
 
     name: str
@@ -50,15 +55,18 @@ class Run:
     keys: frozenset[str]
     interrupted: bool = False
     config: str = ""
+    place: str = ""
 
 
 class RunRecord:
     """The record of a run that is going on; see `recorded_run`."""
 
-    def __init__(self, store: Store, sequence: str, config: str = "") -> None:
+    def __init__(self, store: Store, sequence: str, config: str = "", place: str = "") -> None:
         self._store, self._sequence, self._config = store, sequence, config
+        self._place = "" if place == sequence else place
         self._keys: set[str] = set()
         self._guard = threading.Lock()
+        self._written = b""
         self.interrupted = False
         folder = store.state / "runs" / "active"
         folder.mkdir(parents=True, exist_ok=True)
@@ -73,49 +81,66 @@ class RunRecord:
             raise
 
     def add(self, keys: Iterable[str]) -> None:
-        """Artefacts that the run uses."""
+        """Artefacts that the run uses.
+
+        Where they cannot be written, as to a full disk, the run goes on: retention alone misses them.
+        """
         with self._guard:
             more = set(keys) - self._keys
             if more:
                 self._keys |= more
-                self._write()
+                try:
+                    self._write()
+                except OSError as error:
+                    log.warning("the record of this run could not be written: %s", error)
 
     def close(self) -> None:
         """The run has ended, well or not. The same artefacts again replace the record of the former run."""
         try:
             if self._keys:
-                name = _PREFIX + digest_of([self._sequence, sorted(self._keys)])
+                name = _record_name(self._sequence, self._place, self._keys)
                 write_record(self._store, name, self._content())
         finally:
             # Held on to, the lock would tell of a run that goes on for as long as this process lives.
             self._end()
 
     def _end(self) -> None:
-        self._path.unlink(missing_ok=True)
-        os.close(self._file)
+        try:
+            self._path.unlink(missing_ok=True)
+        finally:
+            os.close(self._file)
 
     def _write(self) -> None:
         text = json.dumps(self._content()).encode()
-        os.pwrite(self._file, text, 0)
-        os.ftruncate(self._file, len(text))
+        try:
+            _write_all(self._file, text)
+        except OSError:
+            # There is room for what was there before: half of the new one would say nothing.
+            _write_all(self._file, self._written)
+            raise
+        self._written = text
 
     def _content(self) -> dict[str, Any]:
         content = {"sequence": self._sequence, "ended": _now(), "keys": sorted(self._keys)}
         content |= {"config": self._config} if self._config else {}
+        content |= {"place": self._place} if self._place else {}
         return content | ({"interrupted": True} if self.interrupted else {})
 
 
 @contextmanager
-def recorded_run(store: Store, sequence: str, config: str = "") -> Iterator[RunRecord | None]:
+def recorded_run(
+    store: Store, sequence: str, config: str = "", place: str = ""
+) -> Iterator[RunRecord | None]:
     """Record the run inside the block; None where the store cannot be written, as for who only looks.
 
     Args:
         store: of its artefacts.
         sequence: its display name.
         config: digest of its settings; empty for none.
+        place: absolute path of a sequence that is one.
     """
     try:
-        record = RunRecord(store, sequence, config)
+        record = RunRecord(store, sequence, config, place)
     except OSError as error:
         log.debug("no record of this run: %s", error)
         yield None
@@ -155,7 +180,8 @@ def file_killed(store: Store) -> list[str]:
             continue
         if run.keys:
             content = {"sequence": run.sequence, "ended": run.ended, "keys": sorted(run.keys)}
-            name = _PREFIX + digest_of([run.sequence, sorted(run.keys)])
+            content |= {"place": run.place} if run.place else {}
+            name = _record_name(run.sequence, run.place, run.keys)
             write_record(store, name, content | {"interrupted": True})
         (store.state / "runs" / run.name).unlink(missing_ok=True)
         filed.append(f"runs/{run.name}")
@@ -169,6 +195,10 @@ def forget(store: Store, runs: Iterable[Run]) -> None:
             (store.state / "runs" / run.name).unlink(missing_ok=True)
         else:
             remove_record(store, run.name)
+
+
+def _record_name(sequence: str, place: str, keys: Iterable[str]) -> str:
+    return _PREFIX + digest_of([sequence, *([place] if place else []), sorted(keys)])
 
 
 def _unfinished(store: Store) -> Iterator[tuple[Run, bool]]:
@@ -187,10 +217,24 @@ def _unfinished(store: Store) -> Iterator[tuple[Run, bool]]:
             os.close(file)
         try:
             run = _parsed(f"active/{path.name}", path.read_bytes())
+            for _ in range(_LOOKS if going_on else 0):
+                if run is not None:
+                    break
+                # Its process is writing it now: what it uses must not be passed over.
+                time.sleep(_BETWEEN_LOOKS_S)
+                run = _parsed(f"active/{path.name}", path.read_bytes())
         except FileNotFoundError:
             continue  # It ended meanwhile; its record is among the others.
         if run is not None:
             yield run, going_on
+
+
+def _write_all(file: int, text: bytes) -> None:
+    """Make a text the content of an open file; a full disk takes a part, and says so at the next."""
+    done = 0
+    while done < len(text):
+        done += os.pwrite(file, text[done:], done)
+    os.ftruncate(file, len(text))
 
 
 def _parsed(name: str, text: bytes) -> Run | None:
@@ -204,8 +248,8 @@ def _run(name: str, record: dict[str, Any]) -> Run | None:
     try:
         keys = frozenset(map(str, record["keys"]))
         interrupted = record.get("interrupted") is True
-        config = str(record.get("config", ""))
-        return Run(name, str(record["sequence"]), str(record["ended"]), keys, interrupted, config)
+        config, place = (str(record.get(field, "")) for field in ("config", "place"))
+        return Run(name, str(record["sequence"]), str(record["ended"]), keys, interrupted, config, place)
     except (KeyError, TypeError):
         return None
 

@@ -104,7 +104,7 @@ def benchmark(given: argparse.Namespace) -> int:
     variants = parsed_variants(given.variants)
     prepare(Store(root).state, debug=given.debug)
     from flows.benchmark import benchmark as flow
-    from flows.benchmark import check_methods
+    from flows.benchmark import check_methods, check_repetitions
     from flows.estimate import expected_seconds
     from flows.history import BenchmarkRegressedError
     from flows.progress_display import RunInView, progress_display
@@ -116,6 +116,7 @@ def benchmark(given: argparse.Namespace) -> int:
 
     # Prefect would say the same in a page of its own words.
     check_methods(methods, variants, given.baseline)
+    check_repetitions(profiles, seeds)
     for profile in profiles:
         profile_config(profile)
     ways = len(profiles) * len(seeds) * (len(methods) + len(variants))

@@ -139,7 +139,7 @@ def finished_run(
     missing = f"{given.sequence} with these settings is not finished in {root}; run it first{otherwise}"
     if not Store(root).exists():
         raise StoreError(f"{missing} (there is no such store)")
-    prepare(Store(root).state, debug=given.debug)
+    prepare(Store(root).state, debug=given.debug, looks=True)
     from flows.methods import METHODS, profile_label
     from flows.runners import NotInStoreError, StoreRunner
     from flows.wiring import SequenceRun

@@ -61,7 +61,7 @@ def compare(given: argparse.Namespace) -> int:
         raise ConfigError(f"--views {given.views}: expected 1 or more")
     set_up_logging(debug=given.debug, terminal=True, quiet=given.quiet)
     store = existing_store(given)
-    prepare(store.state, debug=given.debug)
+    prepare(store.state, debug=given.debug, looks=True)
     from flows.recorded_runs import chosen_runs, compared_run, held_out_digest, run_names
 
     runs = chosen_runs(

@@ -74,7 +74,7 @@ def _renders(given: argparse.Namespace) -> dict[str, Any]:
     from flows.environment import prepare
 
     root, config = store_root(given), run_config(given)
-    prepare(Store(root).state, debug=given.debug)
+    prepare(Store(root).state, debug=given.debug, looks=True)
     from extrags.metrics.folder import read_renders
     from extrags.metrics.protocol import evaluate_views
     from extrags.sequence import EndoscopicSequence

@@ -73,7 +73,7 @@ def gallery(given: argparse.Namespace) -> int:
         raise ConfigError(f"--kb {given.kb}: expected 1 or more")
     set_up_logging(debug=given.debug, terminal=True, quiet=given.quiet)
     store = existing_store(given)
-    prepare(store.state, debug=given.debug)
+    prepare(store.state, debug=given.debug, looks=True)
     from flows.recorded_runs import gallery_run, last_runs
 
     chosen = last_runs(store, given.patterns, methods=items(given.methods), profiles=items(given.profiles))

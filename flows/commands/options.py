@@ -229,7 +229,8 @@ def add_runner(parser: Parser) -> None:
         "--stage-time-limit",
         type=number_above_zero,
         metavar="SECONDS",
-        help="a stage that takes longer fails at its next progress event (default: no limit)",
+        help="a stage that takes longer fails at its next progress event, each of its tasks for itself "
+        "(default: no limit)",
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import re
 import sys
 import time
@@ -34,7 +35,7 @@ from flows.commands.options import (
     add_stages,
     number_above_zero,
 )
-from flows.commands.run_checks import check_methods, check_names, check_working_distance, wrong_source
+from flows.commands.run_checks import check_names, check_working_distance, wrong_source
 from flows.failures import describe_error
 from flows.interruption import RESUMABLE, say_when_interrupted
 from flows.outcome import DatasetFailedError, DatasetOutcome, SequenceOutcome
@@ -229,9 +230,11 @@ def execute(
         # Wrong usage is said before anything is made or loaded.
         run_config(given)
     own_home = has_own_home()
-    prepare(Store(root).state, debug=given.debug)
+    prepare(Store(root).state, debug=given.debug, looks=True)
     always = refresh or always_flow
-    if own_home and (always or not all(_may_be_finished(root, name, until) for name in sequences)):
+    finished = not always and all(_may_be_finished(root, name, until) for name in sequences)
+    # Without a home the store cannot be written; that is said below where something is to be made.
+    if own_home and not finished and Path(os.environ["PREFECT_HOME"]).is_dir():
         start_early()
     cases = _cases(sequences, given, several, root, until)
     try:
@@ -251,8 +254,10 @@ def execute(
         stop_early()
         _record(cases[0], refused, root, until)
         return _raised(DatasetOutcome([refused]), given)
-    check_methods(cases, several.methods, until)
+    from flows.preflight import preflight_cases
     from flows.selection import absolute_manifests
+
+    preflight_cases(cases, until)
 
     # Names were checked by the parser; flows have literals for them.
     arguments: dict[str, Any] = {
@@ -430,12 +435,13 @@ def _from_store(
 
 def _record(case: SequenceCase, outcome: SequenceOutcome, root: str, until: StageName) -> None:
     """Leave on record how a run ended and what it used, if the store can be written."""
+    from data_catalog.names import path_of
     from extrags.store import Store
     from extrags.store.runs import recorded_run
     from flows.cases import record_outcome_quietly
 
     store = Store(root)
-    with recorded_run(store, case.sequence) as used:
+    with recorded_run(store, case.sequence, place=path_of(case.sequence) or "") as used:
         if used is not None:
             used.add(key for row in outcome.stages for key in row.made)
     record_outcome_quietly(store, case, outcome, until, case.config())

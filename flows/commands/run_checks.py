@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from extrags.stages import StageName
     from flows.cases import SequenceCase
 
-__all__ = ["check_methods", "check_names", "check_working_distance", "wrong_source"]
+__all__ = ["check_names", "check_working_distance", "wrong_source"]
 
 log = logging.getLogger(__name__)
 
@@ -31,7 +31,7 @@ def check_names(sequences: list[str]) -> None:
             resolve(sequence)
         except UnknownSequenceError:
             raise
-        except ExtragsError:
+        except (ExtragsError, OSError):
             continue
 
 
@@ -53,7 +53,7 @@ def check_working_distance(cases: Sequence[SequenceCase]) -> None:
         given.add(case.sequence)
         try:
             about = glance(case.sequence, config.ingest) or describe(case.sequence)
-        except (ConfigError, SourceError, UnknownSequenceError):
+        except (ConfigError, SourceError, UnknownSequenceError, OSError):
             # What is wrong with a source is said by the run, for each by itself.
             continue
         if about.has_poses:
@@ -85,18 +85,3 @@ def wrong_source(case: SequenceCase, until: StageName) -> SequenceOutcome | None
         rows += [StageRow(stage, "skipped", reason="ingest failed") for stage in rest]
         return SequenceOutcome(plain_name(case.sequence), "failed", rows, error=error)
     return None
-
-
-def check_methods(cases: Sequence[SequenceCase], methods: Sequence[str], until: StageName) -> None:
-    """Look for what each method needs, with the settings of its first case.
-
-    Raises:
-        ExtragsError: see `flows.preflight.preflight`.
-    """
-    from flows.methods import METHODS
-    from flows.preflight import preflight
-
-    for method in methods:
-        first = next((case for case in cases if case.method == method), None)
-        if first is not None:
-            preflight(first.config(), until, METHODS[method].leave_out)

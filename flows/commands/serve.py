@@ -14,6 +14,9 @@ from flows.commands.options import Parser, add_store
 from flows.interruption import say_when_interrupted
 
 if TYPE_CHECKING:
+    from prefect.client.schemas.actions import DeploymentScheduleCreate
+    from prefect.client.schemas.objects import ConcurrencyLimitConfig
+
     from flows.deployments import Declared
 
 __all__ = ["add_arguments", "serve"]
@@ -85,11 +88,7 @@ def serve(given: argparse.Namespace) -> int:
 
 
 def _deployment(declared: Declared, *, schedules: bool) -> Any:
-    from prefect.client.schemas.actions import DeploymentScheduleCreate
-    from prefect.client.schemas.objects import ConcurrencyLimitConfig
-    from prefect.client.schemas.schedules import CronSchedule
     from prefect.types.entrypoint import EntrypointType
-    from pydantic import ValidationError
 
     if declared.unserved:
         raise declared.error(
@@ -101,25 +100,7 @@ def _deployment(declared: Declared, *, schedules: bool) -> Any:
                 f"work_pool.job_variables.env.{name}: all runs of extrags serve have its own environment, "
                 "where that has another value; set it there, or use a work pool"
             )
-    limit = declared.concurrency_limit
-    unknown = sorted(set(limit).difference(ConcurrencyLimitConfig.model_fields))
-    if unknown:
-        raise declared.error(f"concurrency_limit.{unknown[0]} is no field of Prefect")
-    try:
-        concurrency = ConcurrencyLimitConfig.model_validate(limit) if limit else None
-    except ValidationError as error:
-        fault = error.errors()[0]
-        place = ".".join(("concurrency_limit", *map(str, fault["loc"])))
-        raise declared.error(f"{place}: {fault['msg']}") from error
-    when = (
-        []
-        if declared.cron is None
-        else [
-            DeploymentScheduleCreate(
-                schedule=CronSchedule(cron=declared.cron, timezone=declared.timezone), active=schedules
-            )
-        ]
-    )
+    concurrency, when = _concurrency(declared), _schedules(declared, active=schedules)
     return declared.flow().to_deployment(
         name=declared.name,
         schedules=when,
@@ -130,3 +111,43 @@ def _deployment(declared: Declared, *, schedules: bool) -> Any:
         # Found wherever a run's process is started, unlike a path.
         entrypoint_type=EntrypointType.MODULE_PATH,
     )
+
+
+def _concurrency(declared: Declared) -> ConcurrencyLimitConfig | None:
+    """How many of its runs there may be at the same time.
+
+    Raises:
+        ConfigError: for a limit that is none of Prefect's.
+    """
+    from prefect.client.schemas.objects import ConcurrencyLimitConfig
+    from pydantic import ValidationError
+
+    limit = declared.concurrency_limit
+    unknown = sorted(set(limit).difference(ConcurrencyLimitConfig.model_fields))
+    if unknown:
+        raise declared.error(f"concurrency_limit.{unknown[0]} is no field of Prefect")
+    try:
+        return ConcurrencyLimitConfig.model_validate(limit) if limit else None
+    except ValidationError as error:
+        fault = error.errors()[0]
+        place = ".".join(("concurrency_limit", *map(str, fault["loc"])))
+        raise declared.error(f"{place}: {fault['msg']}") from error
+
+
+def _schedules(declared: Declared, *, active: bool) -> list[DeploymentScheduleCreate]:
+    """When it runs, if it has a schedule.
+
+    Raises:
+        ConfigError: for times or a time zone that are none.
+    """
+    from prefect.client.schemas.actions import DeploymentScheduleCreate
+    from prefect.client.schemas.schedules import CronSchedule
+    from pydantic import ValidationError
+
+    if declared.cron is None:
+        return []
+    try:
+        cron = CronSchedule(cron=declared.cron, timezone=declared.timezone)
+    except ValidationError as error:
+        raise declared.error(f"schedules: {error.errors()[0]['msg']}") from error
+    return [DeploymentScheduleCreate(schedule=cron, active=active)]

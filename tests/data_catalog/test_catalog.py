@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import errno
 import json
+import os
 import pickle
 import re
 import shutil
@@ -10,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import data_catalog.folders
 import extrags
 from data_catalog.catalog import (
     describe,
@@ -21,6 +24,7 @@ from data_catalog.catalog import (
     source_fingerprint,
 )
 from data_catalog.dataset import Source
+from data_catalog.folder_reader import FolderReader
 from data_catalog.phantom.dataset import PHANTOM
 from data_catalog.readers.posed_folder import READER as posed_folder_reader
 from extrags.config import IngestConfig
@@ -108,6 +112,22 @@ class TestFolders:
         for kind in ("a video", "DICOM", "COLMAP", "transforms.json", "poses.json", "C3VD", "SimCol3D"):
             assert kind in caught.value.problem
         assert "docs/sources.md" in caught.value.problem
+
+    def test_one_that_may_not_be_read(self, posed_folder, monkeypatch) -> None:
+        source = resolve(posed_folder)
+
+        def refuse(path: Path, *_: object) -> None:
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+
+        monkeypatch.setattr(FolderReader, "glance", lambda self, path, *_: refuse(path))
+        monkeypatch.setattr(FolderReader, "fingerprint", lambda self, path: refuse(path))
+        for looked_at in (lambda: glance(posed_folder), lambda: source_fingerprint(source)):
+            with pytest.raises(SourceError, match="it cannot be read: Permission denied") as error:
+                looked_at()
+            assert error.value.file == source.path
+        monkeypatch.setattr(data_catalog.folders, "_recognised", refuse)
+        with pytest.raises(SourceError, match="it cannot be read: Permission denied"):
+            resolve(posed_folder)
 
     def test_a_reader_from_outside_is_named_with_its_layout(self, tmp_path, monkeypatch) -> None:
         def never(folder: Path) -> bool:

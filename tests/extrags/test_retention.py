@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import errno
 import json
 import os
@@ -14,7 +15,9 @@ from pathlib import Path
 
 import pytest
 
+from extrags.errors import StoreError
 from extrags.store import Ref, Store
+from extrags.store.directory import DirectoryBackend
 from extrags.store.records import remove_record
 from extrags.store.retention import Policy, Removal, apply_policy, planned_removals, usage
 from extrags.store.runs import active_runs, file_killed, recorded_run, runs_of
@@ -116,6 +119,17 @@ class TestRuns:
         assert planned(three, keep_last=3) == []
         assert planned(three, keep_last=2) == ["judged0", "final0"]
         assert planned(three, keep_last=1) == ["judged0", "judged1", "final0", "final1"]
+
+    def test_relative_names_of_several_places_are_several_sequences(self, store: Store) -> None:
+        """Two groups share a store, and both call a folder of theirs `scan`."""
+        for place in ("/a/scan", "/b/scan"):
+            name = f"judged{place[1]}"
+            put(store, name, days=30, label="scan")
+            with recorded_run(store, "scan", place=place) as record:
+                assert record is not None
+                record.add([f"{name}-v1-00"])
+        assert {run.place for run in runs_of(store)} == {"/a/scan", "/b/scan"}
+        assert planned(store, keep_last=1) == []
 
     def test_the_same_run_again_counts_once_and_is_the_last(self, three: Store) -> None:
         assert len(runs_of(three)) == 4
@@ -241,6 +255,26 @@ class TestRuns:
         remove_record(store, runs_of(store)[0].name)
         assert runs_of(store) == []
 
+    def test_what_runs_go_on_to_use_on_an_object_store_stays(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """Nothing there has a time of use: a night that finds everything is a use all the same."""
+        store = Store(f"memory://{uuid.uuid4().hex}", cache=tmp_path)
+        put(store, "report", sequence=put(store, "ingest"))
+        put(store, "other")
+        nights = time.time() + 100 * DAY_S
+        with monkeypatch.context() as patched:
+            told = datetime.datetime.fromtimestamp(nights, datetime.UTC).isoformat(timespec="microseconds")
+            patched.setattr("extrags.store.runs._now", lambda: told)
+            with recorded_run(store, "phantom/0") as record:
+                assert record is not None
+                record.add(["ingest-v1-00", "report-v1-00"])
+        old = Policy(older_than_s=90 * DAY_S)
+        assert names(planned_removals(store, old, now=nights + DAY_S)[0]) == ["other"]
+        assert len(planned_removals(store, old, now=nights + 91 * DAY_S)[0]) == 3
+        (row,) = usage(store)
+        assert row.used == told[:19] + "+00:00"
+
 
 class TestVersions:
     def test_what_earlier_versions_made_goes_and_what_later_ones_made_stays(self, chain: Store) -> None:
@@ -286,6 +320,21 @@ def test_nothing_is_removed_that_a_run_has_begun_to_use_since(
     assert chain.keys() == ["coarse-v1-00", "ingest-v1-00"]
 
 
+def test_what_cannot_be_removed_hinders_no_other(chain: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    usual = DirectoryBackend.discard
+
+    def discard(backend: DirectoryBackend, key: str) -> bool:
+        if key == "coarse-v1-00":
+            raise StoreError(f"{key} cannot be removed: Permission denied")
+        return usual(backend, key)
+
+    monkeypatch.setattr(DirectoryBackend, "discard", discard)
+    with pytest.raises(StoreError, match=r"1 of 3 artefacts could not be removed: coarse-v1-00 cannot"):
+        apply_policy(chain, Policy(older_than_s=0.0, with_inputs=True))
+    # It stays with what it was made from.
+    assert chain.keys() == ["coarse-v1-00", "ingest-v1-00"]
+
+
 def test_usage(chain: Store) -> None:
     put(chain, "coarse1", label="phantom/1")
     first, second = usage(chain)
@@ -324,6 +373,40 @@ def test_a_run_that_cannot_be_recorded_holds_no_lock(
                 record.add(["toy-v1-x"])
     assert active_runs(store) == []
     assert len(os.listdir("/proc/self/fd")) == before
+
+
+def test_a_disk_that_is_full_in_the_middle_ends_no_run_and_keeps_the_record(
+    store: Store, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    usual, full_from = os.pwrite, len(store.root) + 200
+
+    def nearly_full(file: int, text: bytes, offset: int) -> int:
+        if offset >= full_from:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return usual(file, text[: full_from - offset], offset)
+
+    monkeypatch.setattr(os, "pwrite", nearly_full)
+    with recorded_run(store, "phantom/0") as record:
+        assert record is not None
+        record.add(["ingest-v1-00"])
+        record.add(f"coarse-v1-{number:032d}" for number in range(20))
+        (run,) = active_runs(store)
+        assert run.keys == {"ingest-v1-00"}
+        assert "could not be written: [Errno 28]" in caplog.text
+    (ended,) = runs_of(store)
+    assert len(ended.keys) == 21
+
+
+def test_a_record_that_is_half_written_is_read_again(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    with recorded_run(store, "phantom/0") as record:
+        assert record is not None
+        record.add(["ingest-v1-00"])
+        (path,) = (store.state / "runs" / "active").iterdir()
+        whole = path.read_bytes()
+        path.write_bytes(whole[:-9])
+        monkeypatch.setattr("time.sleep", lambda _: path.write_bytes(whole))
+        (run,) = active_runs(store)
+        assert run.keys == {"ingest-v1-00"}
 
 
 def test_a_record_is_plain_json(store: Store) -> None:

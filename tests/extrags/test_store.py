@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import stat
 import subprocess
 import sys
 import uuid
@@ -17,9 +18,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import BaseModel
 
+import extrags.store.directory
 from extrags.config import CoarseConfig, IngestConfig
 from extrags.errors import ConfigError, DamagedArtefactError, MissingDependencyError, StoreError
-from extrags.store import MANIFEST, Ref, Store, canonical, content_digest, digest_of
+from extrags.store import MANIFEST, Manifest, Ref, Store, canonical, content_digest, digest_of
+from extrags.store.integrity import Examinable
 
 plain = st.recursive(
     st.none()
@@ -292,6 +295,24 @@ class TestDirectory:
         (store.open(ref) / "deep" / "file.txt").write_text("jello")
         assert not store.verify(ref)
 
+    def test_files_are_as_open_as_the_umask_says(self, tmp_path: Path) -> None:
+        store, before = Store(tmp_path), os.umask(0o002)
+        try:
+            with store.slot(stage="s", version=1, key="s-v1-a") as slot:
+                (slot.path / "usual").write_bytes(b"x")
+                (slot.path / "folder").mkdir()
+                private = slot.path / "folder" / "private"
+                # As writers do that make a temporary file first.
+                os.close(os.open(private, os.O_WRONLY | os.O_CREAT, 0o600))
+            with store.slot(stage="s", version=1, key="s-v1-b") as slot:
+                (slot.path / "program").write_bytes(b"x")
+                (slot.path / "program").chmod(0o755)
+        finally:
+            os.umask(before)
+        files = [path for path in (tmp_path / "artefacts").rglob("*") if path.is_file()]
+        modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in files}
+        assert modes == {"usual": 0o664, "private": 0o664, "program": 0o775, "manifest.json": 0o664}
+
     def test_a_store_that_cannot_be_written_says_so(self, tmp_path: Path) -> None:
         (tmp_path / "file").write_text("x")
         with pytest.raises(StoreError, match="cannot be written"):
@@ -321,6 +342,24 @@ class TestDirectory:
             assert removed[0].startswith("scratch/toy-v1-aa.")
         assert [manifest.key for manifest in store.ls()] == ["toy-v1-bb"]
         assert list((tmp_path / "scratch").iterdir()) == []
+
+    def test_what_is_removed_while_it_is_made_anew_is_there_whole(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        store = Store(tmp_path)
+        put(store)
+        looked = extrags.store.directory.intact_manifest
+
+        def then_removed(backend: Examinable, key: str) -> Manifest | None:
+            found = looked(backend, key)
+            store.rm(key)
+            return found
+
+        monkeypatch.setattr(extrags.store.directory, "intact_manifest", then_removed)
+        with store.slot(stage="toy", version=1, key="toy-v1-aa", renew=True) as slot:
+            (slot.path / "deep").mkdir()
+            (slot.path / "deep" / "file.txt").write_text("hello")
+        assert (store.open(slot.ref) / "deep" / "file.txt").read_text() == "hello"
 
     def test_several_processes_write_one_key(self, tmp_path: Path) -> None:
         context = multiprocessing.get_context("spawn")

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import pickle
+import shutil
 import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,6 +17,7 @@ import pytest
 
 from extrags.errors import ArtefactGoneError, ConfigError, DamagedArtefactError, StoreError
 from extrags.store import MANIFEST, Manifest, Ref, Storable, Store
+from extrags.store.artefacts import _as_damage
 from extrags.store.manifest import manifest_text
 from extrags.zarr_io import new_group, open_group, read_array, write_array, write_frames
 
@@ -336,6 +340,31 @@ class TestSetAside:
         assert removed.startswith(f"damaged/{KEY}.")
         assert place.store.gc() == []
 
+    def test_two_may_clean_at_once(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        store = Store(tmp_path)
+        for name in ("first", "second"):
+            (tmp_path / "failed" / name).mkdir(parents=True)
+        usual = shutil.rmtree
+
+        def slower(place: Path, *given: Any, **more: Any) -> None:
+            if Path(place).name == "first":
+                usual(place)
+            usual(place, *given, **more)
+
+        with monkeypatch.context() as patched:
+            patched.setattr(shutil, "rmtree", slower)
+            assert store.gc() == ["failed/first", "failed/second"]
+        assert list((tmp_path / "failed").iterdir()) == []
+        # What is being set aside loses its place.
+        put(store)
+        (tmp_path / "artefacts" / KEY / CHUNK).unlink()
+        rename = Path.rename
+        monkeypatch.setattr(Path, "rename", lambda path, to: (usual(to.parent), rename(path, to))[1])
+        assert store.find_or_set_aside(KEY) is None
+        monkeypatch.undo()
+        put(store)
+        assert store.find(KEY) is not None
+
     def test_what_another_process_has_made_anew_stays(self, place: Place) -> None:
         ref = put(place.store)
         place.change(CHUNK, flipped)
@@ -361,11 +390,50 @@ class TestSetAside:
         assert place.store.rm(pattern) == [KEY]
         assert place.store.keys() == []
 
+    def test_a_manifest_that_the_disk_does_not_give_back_is_damage_to_who_looks_through_the_store(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        store = Store(tmp_path)
+        put(store)
+        usual, number = Path.read_bytes, errno.EIO
+
+        def failing(path: Path) -> bytes:
+            if path.name == MANIFEST and path.parent.is_dir():
+                raise OSError(number, os.strerror(number), str(path))
+            return usual(path)
+
+        monkeypatch.setattr(Path, "read_bytes", failing)
+        # It may pass: who needs the artefact tries again before it is given up.
+        with pytest.raises(StoreError) as found:
+            store.find(KEY)
+        assert not isinstance(found.value, DamagedArtefactError)
+        assert store.ls() == []
+        assert "manifest.json: cannot be read: Input/output error" in caplog.text
+        damage = store.examine(KEY)
+        assert isinstance(damage, DamagedArtefactError)
+        assert store.set_aside(damage) is not None
+        assert store.find(KEY) is None
+        # An object store answers so when it is busy.
+        with pytest.raises(StoreError, match="busy"):
+            _as_damage(_caused_by(OSError(errno.EIO, "busy")), KEY, "s3://bucket")
+        # What this user may not read may be whole.
+        (tmp_path / "artefacts" / KEY).mkdir()
+        number = errno.EACCES
+        for look in (store.ls, lambda: store.examine(KEY), lambda: store.rm("*")):
+            with pytest.raises(StoreError, match="Permission denied"):
+                look()
+
     def test_writing_the_same_again_replaces_a_damaged_artefact(self, place: Place) -> None:
         ref = put(place.store)
         place.change(CHUNK, flipped)
         assert put(place.store) == ref
         assert place.store.verify(ref)
+
+
+def _caused_by(cause: OSError) -> StoreError:
+    error = StoreError(str(cause))
+    error.__cause__ = cause
+    return error
 
 
 class TestSlot:

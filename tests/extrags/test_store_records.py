@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import subprocess
 import sys
 import threading
@@ -171,3 +173,26 @@ class TestRenewed:
         fill(store, "toy-v1-a", "x")
         assert store.ls() == [first]
         json.dumps(first.model_dump(mode="json"))
+
+
+@pytest.mark.parametrize("number", [errno.EIO, errno.EACCES])
+def test_a_record_that_the_disk_does_not_give_back_hides_no_other(
+    number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    store = Store(tmp_path)
+    for name in ("one", "other"):
+        write_record(store, name, {"name": name})
+    usual = Path.read_bytes
+
+    def failing(path: Path) -> bytes:
+        if path.name == "one.json":
+            raise OSError(number, os.strerror(number), str(path))
+        return usual(path)
+
+    monkeypatch.setattr(Path, "read_bytes", failing)
+    if number == errno.EIO:
+        assert read_records(store) == {"other": {"name": "other"}}
+        assert "the record one.json" in caplog.text
+    else:
+        with pytest.raises(StoreError, match="Permission denied"):
+            read_records(store)

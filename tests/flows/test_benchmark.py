@@ -258,6 +258,20 @@ class TestNames:
         with pytest.raises(ConfigError, match=message):
             check_methods(methods, variants, baseline)
 
+    @pytest.mark.parametrize(
+        ("twice", "message"),
+        [
+            ({"seeds": [0, 1, 0]}, "a seed is given twice: 0, 1, 0"),
+            ({"profiles": ["quick", "quick"]}, "a profile is given twice: quick, quick"),
+        ],
+    )
+    def test_what_is_given_twice_is_refused_before_anything_runs(
+        self, twice: dict[str, Any], message: str, tmp_path: Path
+    ) -> None:
+        with pytest.raises(ConfigError, match=message):
+            benchmark.fn(sequences=[SEQUENCE], store=str(tmp_path / "store"), **twice)
+        assert not (tmp_path / "store").exists()
+
     def test_variants_say_what_they_are(self) -> None:
         assert summary_of("no-light", NO_LIGHT) == "coarse with coarse.light.enabled = False"
         assert "plain 3D Gaussian Splatting" in summary_of("3dgs", NO_LIGHT)

@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import shutil
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from data_catalog.folders import FolderDataset
 from extrags.errors import ConfigError
 from extrags.store import Store, write_record
 from extrags.store.records import remove_record
 from extrags.store.runs import recorded_run
 from flows.cases import SequenceCase, cases_of, matrix_points, record_outcome, selected
 from flows.cli import main
+from flows.commands.run_checks import check_names
 from flows.dataset import reconstruct_dataset
 from flows.expectation import Expectation, expectations, expected_words, longest_first
 from flows.outcome import DatasetFailedError, SequenceOutcome, StageRow
 from flows.outcome_records import outcome_records
 from flows.selection import Chosen
 from flows.store_status import store_status
+from flows.workloads import expected_work
 from tests.flows.tiny import SEQUENCE, TINY
 
 
@@ -269,6 +274,18 @@ class TestExpected:
         assert expected_words(found, 2, processes=True).startswith("2 runs, about 60 min; 2 at once")
         assert expected_words(found[:1]) == "1 run, about 60 min; as measured in earlier runs"
         assert expected_words(found[1:]) == "1 run, about 10 min; by their frames"
+
+    def test_a_disk_that_is_gone_stops_no_other_sequence(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def gone(*_: object) -> None:
+            raise OSError(errno.EIO, os.strerror(errno.EIO), str(tmp_path))
+
+        monkeypatch.setattr(FolderDataset, "resolve", gone)
+        check_names([str(tmp_path), SEQUENCE])
+        (found,) = expectations([case(str(tmp_path))], str(tmp_path / "store"), "report")
+        assert not found.sized
+        assert expected_work(str(tmp_path), case().config()) is None
 
     def test_a_folder_that_was_not_read_is_taken_for_a_phantom(self, tmp_path: Path) -> None:
         (found,) = expectations([case(str(tmp_path))], str(tmp_path / "store"), "coarse")

@@ -7,13 +7,16 @@ import json
 import os
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from extrags.errors import StoreError
 from extrags.store import Store
 from extrags.store.runs import runs_of
 from flows.cases import SequenceCase, record_outcome
 from flows.cli import main
+from flows.environment import prepare
 from flows.outcome import SequenceOutcome, StageRow
 from flows.outcome_records import outcome_records
 from flows.run_costs import RunPrediction
@@ -21,6 +24,20 @@ from tests.documented_json import undocumented
 from tests.flows.tiny import SEQUENCE, TINY, settled
 
 pytestmark = pytest.mark.usefixtures("untouched_environment")
+
+
+def no_home(store: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Prefect's home can not be made in a store, as in one of another user that runs on a server filled."""
+    usual = Path.mkdir
+
+    def refused(path: Path, *given: Any, **more: Any) -> None:
+        if path == Path(store) / "prefect":
+            raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(path))
+        usual(path, *given, **more)
+
+    for name in ("PREFECT_HOME", "PREFECT_API_URL"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(Path, "mkdir", refused)
 
 
 class TestFinished:
@@ -183,13 +200,13 @@ class TestFinished:
         monkeypatch: pytest.MonkeyPatch,
         capsys: pytest.CaptureFixture[str],
     ) -> None:
-        from extrags.errors import StoreError
         from extrags.store.directory import DirectoryBackend
 
         def refuse(*_: object, **__: object) -> None:
             raise StoreError("the store cannot be written: Read-only file system")
 
         page = tmp_path / "page.html"
+        no_home(finished[0], monkeypatch)
         monkeypatch.setattr(DirectoryBackend, "check_writable", refuse)
         monkeypatch.setattr("extrags.store.artefacts.private_directory", refuse)
         assert main(["report", SEQUENCE, *settled(finished[0]), "-o", str(page)]) == 0
@@ -198,6 +215,19 @@ class TestFinished:
         assert "came from the cache" not in page.read_text()
         assert main(["report", SEQUENCE, *settled(finished[0])]) == 1
         assert "Read-only file system" in capsys.readouterr().err
+
+    def test_a_run_that_is_finished_in_a_store_that_cannot_be_written(
+        self,
+        finished: tuple[str, SequenceOutcome],
+        monkeypatch: pytest.MonkeyPatch,
+        capsys: pytest.CaptureFixture[str],
+    ) -> None:
+        no_home(finished[0], monkeypatch)
+        assert main(["run", SEQUENCE, *settled(finished[0]), "--until", "evaluate"]) == 0
+        assert "9 cached, 2 skipped" in capsys.readouterr().err
+        monkeypatch.delenv("PREFECT_HOME")
+        with pytest.raises(StoreError, match="cannot be written: Read-only file system"):
+            prepare(Store(finished[0]).state)
 
     @pytest.mark.parametrize("scene", ["coarse", "final"])
     def test_export_writes_ply(

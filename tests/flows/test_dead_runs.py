@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import errno
 import os
 import signal
 import subprocess
@@ -17,6 +18,7 @@ from uuid import UUID, uuid4
 import pytest
 from prefect.client.orchestration import get_client
 from prefect.client.schemas.objects import FlowRun, State, StateType
+from prefect.context import FlowRunContext
 from prefect.exceptions import ObjectNotFound
 from prefect.settings import PREFECT_API_URL
 from prefect.states import Completed, Pending, Scheduled
@@ -233,6 +235,25 @@ def test_a_run_that_never_started_is_dead_after_an_hour(
         run = FlowRun(id=uuid4(), flow_id=uuid4(), state=state, state_type=StateType.PENDING)
         silent(monkeypatch, run, last_beat_s=None)
         assert settle_dead_runs(str(tmp_path))[0] == ([run] if dead else [])
+
+
+def test_a_store_that_is_gone_at_the_end_fails_no_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def gone(path: Path, **_: object) -> None:
+        raise OSError(errno.ESTALE, os.strerror(errno.ESTALE), str(path))
+
+    monkeypatch.setattr("flows.leases._settle_beside_the_run", lambda _: None)
+    run = FlowRun(flow_id=uuid4())
+    before = len(os.listdir("/proc/self/fd"))
+    with (
+        FlowRunContext.model_construct(flow_run=run),
+        monkeypatch.context() as patched,
+        run_lease(str(tmp_path)),
+    ):
+        patched.setattr(Path, "unlink", gone)
+    assert "the lease of this run stays: [Errno 116]" in caplog.text
+    assert len(os.listdir("/proc/self/fd")) == before
 
 
 def test_outside_a_run_there_is_no_lease(tmp_path: Path) -> None:

@@ -51,6 +51,10 @@ class TestFile:
             ("a: 1", "declares no deployments"),
             ("deployments: [{name: x}]", "a name and an entrypoint"),
             ("deployments: [{name: x, entrypoint: a.b, schedules: [{interval: 3}]}]", "one schedule at most"),
+            ("deployments: [{name: x, entrypoint: a.b, schedules: {cron: '0 2 * * *'}}]", "one schedule at"),
+            ("deployments: [{name: x, entrypoint: a.b, schedules: ['0 2 * * *']}]", "one schedule at most"),
+            ("deployments: [{name: x, entrypoint: a.b, schedules: [{timezone: UTC}]}]", "cron as a text"),
+            ("deployments: [{name: x, entrypoint: a.b, tags: extrags}]", "tags: expected a list"),
             ("deployments: [{name: x, entrypoint: a.b, work_pool: y}]", "deployment x: work_pool: expected"),
         ],
     )
@@ -122,6 +126,10 @@ class TestServe:
         assert served.concurrency_options.collision_strategy == "CANCEL_NEW"
         assert served_from(tmp_path, "concurrency_limit: 3").concurrency_limit == 3
         assert served_from(tmp_path, "concurrency_limit: {limit: null}").concurrency_limit is None
+        (when,) = served_from(
+            tmp_path, "schedules: [{cron: '0 2 * * *', timezone: Europe/Zurich}]", "tags: [night]"
+        ).schedules
+        assert (when.schedule.cron, when.schedule.timezone) == ("0 2 * * *", "Europe/Zurich")
 
     @pytest.mark.parametrize(
         ("line", "field"),
@@ -137,6 +145,8 @@ class TestServe:
                 r"concurrency_limit\.collision_strategy",
             ),
             ("concurrency_limit: {limit: 1, strategy: ENQUEUE}", r"concurrency_limit\.strategy"),
+            ("schedules: [{cron: '0 2 * *'}]", 'schedules: .*Invalid cron string: "0 2'),
+            ("schedules: [{cron: '0 2 * * *', timezone: Europe/Bern}]", "schedules: .*Invalid timezone"),
             ("parameters: {sequence: phantom/0, settingz: {}}", r"parameters\.settingz: .*settings"),
         ],
     )

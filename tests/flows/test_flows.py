@@ -18,7 +18,7 @@ from prefect.task_runners import ThreadPoolTaskRunner
 import extrags.cores
 import flows.dataset
 import tasks.progress
-from extrags.errors import ConfigError, StoreError
+from extrags.errors import ArtefactGoneError, ConfigError, StoreError
 from extrags.stages import STAGES
 from extrags.store import Store
 from flows.dataset import reconstruct_dataset
@@ -170,6 +170,39 @@ def test_an_interrupted_dataset_begins_no_more_sequences(
     assert len(begun) <= 3
     assert all(told)
     assert not interrupted.is_set(), "further runs of this process are not interrupted"
+
+
+@pytest.mark.usefixtures("prefect_server")
+def test_a_dataset_makes_each_stage_anew_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also what its runs share, and where the page of all of them meets damage."""
+    slot, build = Store.slot, flows.dataset.dataset_page
+    made: list[str] = []
+    pages: list[Any] = []
+
+    def counted(store: Store, *, key: str, **more: Any) -> Any:
+        made.append(key)
+        return slot(store, key=key, **more)
+
+    def page(*given: Any) -> str:
+        pages.append(given)
+        if len(pages) == 1:
+            raise ArtefactGoneError("it was removed meanwhile", "report-v1-00")
+        return build(*given)
+
+    monkeypatch.setattr(Store, "slot", counted)
+    monkeypatch.setattr(flows.dataset, "dataset_page", page)
+    found = reconstruct_dataset(
+        sequences=[SEQUENCE],
+        profile="quick",
+        settings={**TINY, "coarse.iterations": 20},
+        store=str(tmp_path),
+        methods=["coarse", "3dgs"],
+        refresh=True,
+    )
+    assert [outcome.status for outcome in found.sequences] == ["ok", "ok"]
+    assert len(pages) == 2
+    assert len(set(made)) == len(made) > 8
+    assert sum(key.startswith("ingest-") for key in made) == 1
 
 
 @pytest.mark.parametrize("inner", [False, True])

@@ -18,10 +18,11 @@ from extrags.metrics.lpips_weights import WEIGHTS_VARIABLE
 from extrags.raster.native import usable_isas
 from extrags.store import Ref, Store
 from flows.benchmark import benchmark
+from flows.cases import SequenceCase
 from flows.cli import main
 from flows.methods import METHODS
 from flows.outcome import SequenceOutcome
-from flows.preflight import preflight
+from flows.preflight import preflight, preflight_cases
 from flows.runners import DirectRunner, NotInStoreError, StoreRunner
 from flows.settings import pipeline_config
 from flows.wiring import run_sequence
@@ -158,6 +159,19 @@ class TestWhatIsLookedFor:
             preflight(pipeline_config("quick"), "report")
 
     @pytest.mark.usefixtures("prefect_server")
+    def test_what_one_sequence_of_a_dataset_lacks_stops_no_other(self) -> None:
+        def lacking(name: str, **more: Any) -> SequenceCase:
+            return SequenceCase(name, profile="quick", settings=MISSING, **more)
+
+        sound = SequenceCase("phantom/1", profile="quick")
+        preflight_cases([lacking("phantom/0"), sound], "report")
+        preflight_cases([sound, lacking("phantom/0")], "report")
+        with pytest.raises(WeightsError, match="no/such"):
+            preflight_cases([lacking("phantom/0"), lacking("phantom/1")], "report")
+        # Of each method one must be able to run.
+        with pytest.raises(WeightsError, match="no/such"):
+            preflight_cases([sound, lacking("phantom/0", method="exploregs")], "report")
+
     def test_a_benchmark_looks_before_its_first_run(self, tmp_path: Path) -> None:
         with pytest.raises(WeightsError, match="no/such"):
             benchmark(

@@ -17,6 +17,7 @@ from extrags.errors import ConfigError, StoreError
 from extrags.pipeline import HELD_OUT_TRAINED_ON
 from extrags.sequence import EndoscopicSequence
 from extrags.store import Store, write_record
+from extrags.store.records import remove_record
 from flows.cases import SequenceCase, record_outcome
 from flows.cli import main
 from flows.commands.common import _on_record, parsed_settings, run_options
@@ -147,6 +148,26 @@ def test_rows_of_the_leaderboard(store: Store) -> None:
     assert rows[1].link.startswith("file://")
     assert board_rows(store, ["c3vd/*"]) == []
     assert len(board_rows(store, ["phantom/*"])) == 3
+
+
+def test_relative_names_of_several_places_are_several_sequences(store: Store, tmp_path: Path) -> None:
+    """Of two groups that share a store: no mean is over the scans of both."""
+    root = tmp_path / "store"
+    shutil.copytree(store.root, root)
+    copy = Store(str(root))
+    (first, *others) = [
+        (name, record) for name, record in outcome_records(copy).items() if record["status"] == "ok"
+    ]
+    for name, _ in others:
+        remove_record(copy, name)
+    for place in ("a", "b"):
+        named = {"sequence": "scan", "path": f"/{place}/scan"}
+        write_record(copy, f"{OUTCOME}{place}", {**first[1], **named})
+    rows = {row.sequence for row in board_rows(copy, ["scan"])}
+    assert rows == {"/a/scan", "/b/scan"}
+    assert {row.sequence for row in board_rows(copy, ["/a/*"])} == {"/a/scan"}
+    assert [run.place for run in last_runs(copy, ["scan"])] == ["/a/scan", "/b/scan"]
+    assert len(last_runs(copy, ["/b/scan"])) == 1
 
 
 def test_both_pages_from_the_command_line(

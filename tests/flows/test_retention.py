@@ -110,6 +110,15 @@ def test_the_flow(store: Store) -> None:
     before = len(store.keys())
     said = retention(store=store.root, older_than_days=30, dry_run=True)
     assert (said["artefacts"], len(store.keys())) == (before, before)
+    # As of a page that was opened yesterday, and of nothing else.
+    (page,) = store.ls("report")
+    yesterday = time.time() - 86400
+    os.utime(Path(store.root) / "artefacts" / page.key, (yesterday, yesterday))
+    said = retention(store=store.root, older_than_days=30, dry_run=True)
+    assert said["artefacts"] < before - 1
+    said = retention(store=store.root, older_than_days=30, with_inputs=True, dry_run=True)
+    assert said["artefacts"] == before - 1
+    os.utime(Path(store.root) / "artefacts" / page.key, (0, 0))
     said = retention(store=store.root, older_than_days=30, flow_runs_days=1)
     assert (said["artefacts"], store.keys(), said["flow_runs"]) == (before, [], 0)
     later = datetime.datetime.now(datetime.UTC) + datetime.timedelta(hours=1)

@@ -6,6 +6,7 @@ import asyncio
 import base64
 import io
 import logging
+import re
 import threading
 import time
 from pathlib import Path
@@ -32,7 +33,7 @@ from flows.sequence import reconstruct_sequence
 from tasks import run_page as senders
 from tasks.page_choice import PAGE_VARIABLE
 from tasks.run_log import RunLogHandler, run_log
-from tasks.run_page import artifact_key
+from tasks.run_page import artifact_key, plain_letters
 from tasks.stage import at, stage
 from tests.flows.tiny import SEQUENCE, TINY, tiny_config
 
@@ -138,6 +139,20 @@ class TestProgress:
 
 
 @pytest.mark.usefixtures("prefect_server")
+def test_names_in_other_scripts_have_pages_of_their_own() -> None:
+    names = ["患者一", "患者二", "scans/Müller", "scans/Möller", "left", ""]
+    keys = [artifact_key("progress", name) for name in names]
+    assert len(set(keys)) == len(names)
+    assert all(re.fullmatch(r"[a-z0-9]+(-[a-z0-9]+)*", key) for key in keys)
+    assert keys[4:] == ["progress-left", "progress"]
+    assert keys[2].startswith("progress-scans-m-ller-")
+    assert artifact_key("preview", SEQUENCE) == "preview-phantom-0-sparse"
+    # As a part of the name of a file.
+    pictures = [plain_letters(name, "A-Za-z0-9@.") for name in (*names[:4], SEQUENCE)]
+    assert len(set(pictures)) == len(pictures)
+    assert pictures[-1] == "phantom-0@sparse"
+
+
 class TestLog:
     def test_the_librarys_lines_reach_the_runs_log(
         self, tmp_path: Path, caplog: pytest.LogCaptureFixture

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import pytest
@@ -114,6 +115,16 @@ def test_yaml_and_json_have_settings(tmp_path: Path) -> None:
 def test_a_wrong_manifest_is_refused(name: str, text: str, message: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=message):
         chosen_sequences([manifest(tmp_path, name, text)])
+
+
+def test_a_name_that_is_no_utf8_is_refused(tmp_path: Path) -> None:
+    folder = tmp_path / os.fsdecode(b"M\xfcller")
+    folder.mkdir()
+    with pytest.raises(ConfigError, match=r"the name .*/M\\udcfcller is no UTF-8"):
+        names([str(folder)])
+    # Other scripts are.
+    (tmp_path / "Müller 一").mkdir()
+    assert names([str(tmp_path / "Müller 一")]) == [str(tmp_path / "Müller 一")]
 
 
 def test_what_is_not_there_is_refused(tmp_path: Path) -> None:

@@ -150,7 +150,7 @@ def test_a_run_notes_the_settings_that_its_record_will_have(
     noted: list[str] = []
 
     @contextmanager
-    def noting(store: Store, sequence: str, config: str) -> Iterator[None]:
+    def noting(store: Store, sequence: str, config: str, place: str) -> Iterator[None]:
         noted.append(config)
         yield None
 

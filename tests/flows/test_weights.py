@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from extrags.config import EvaluateConfig, profile_config
+from extrags.errors import WeightsError
 from extrags.metrics import lpips_weights as search
 from extrags.metrics.lpips_weights import WEIGHTS_VARIABLE
 from flows.cli import main
@@ -68,6 +70,25 @@ def test_the_weights_of_each_backbone_have_a_digest_of_their_own(shared_data: Pa
     found = lpips_weights(EvaluateConfig(lpips_nets=("alex", "vgg")))
     assert [item.net for item in found] == ["alex", "vgg"]
     assert len({item.digest for item in found} - {None}) == 2
+
+
+@pytest.mark.parametrize("then", ["others", "gone"])
+def test_weights_that_changed_since_the_key_was_made_are_refused(
+    shared_data: Path, tmp_path: Path, then: str
+) -> None:
+    """Also those that a worker on another machine finds in the same place."""
+    file = tmp_path / "lpips_alex_v0.1.npz"
+    shutil.copy(shared_data / "lpips_weights" / file.name, file)
+    (weights,) = lpips_weights(EvaluateConfig(lpips_nets=("alex",), lpips_weights=str(file)))
+    assert weights.lpips() is not None
+    if then == "gone":
+        file.unlink()
+    else:
+        with np.load(file) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+        np.savez(file, **{**arrays, "lin0": 2 * arrays["lin0"]})
+    with pytest.raises(WeightsError, match=r"LPIPS with alex .* not those this run began with"):
+        weights.perceptual_difference()
 
 
 def test_tables_have_the_backbones_that_were_asked_for() -> None:
