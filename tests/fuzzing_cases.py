@@ -18,7 +18,6 @@ from data_catalog.readers.colmap_model import write_colmap
 from data_catalog.readers.transforms_json import write_transforms
 from extrags.config import IngestConfig
 from extrags.depth.weights import load_completion
-from extrags.errors import WeightsError
 from extrags.export import CameraPath, read_camera_path, write_camera_path
 from extrags.gaussians import Gaussians
 from extrags.illumination import NearFieldLight
@@ -222,12 +221,9 @@ def tensors(folder: Path) -> Path:
 
 @cache
 def _restorer() -> EmbeddedEnhancer:
-    from extrags.restoration.diffusion.weights import find_weights
+    from extrags.restoration.diffusion.weights import COLONS, starting_weights
 
-    found = find_weights("bundled")
-    if found is None:
-        raise WeightsError("the package has no weights")
-    whole = EmbeddedEnhancer.load(found)
+    whole = EmbeddedEnhancer.load(starting_weights(COLONS))
     return replace(whole, record={})
 
 

@@ -141,8 +141,8 @@ class EnhanceConfig(StageConfig):
     pretrained_weights: str = Field(
         "bundled",
         min_length=1,
-        description="what the embedded backend starts from: bundled (weights of the package), none (the "
-        "scene's own pairs alone), or a path",
+        description="what the embedded backend starts from: bundled (weights of the package: those that know "
+        "the scene), colons or cavities (one set of them), none (the scene's own pairs alone), or a path",
     )
     folds: int = Field(2, ge=1, description="leave-out reconstructions that make training pairs")
     fold_iterations: int = Field(300, ge=1, description="optimisation steps of each of them")

@@ -82,7 +82,8 @@ def _domain_words(score: float) -> str:
 
 
 def _judged_words(provenance: Mapping[str, Any]) -> str:
-    said = f"Restored by {provenance['backend']}."
+    trained_on = provenance.get("trained_on")
+    said = f"Restored by {provenance['backend']}{f', weights for {trained_on}' if trained_on else ''}."
     judged = provenance.get("judged")
     if not judged:
         if provenance["backend"] == "classical" and provenance.get("reason"):

@@ -20,6 +20,7 @@ from extrags.depth.weights import load_completion
 from extrags.illumination import NearFieldLight
 from extrags.restoration.diffusion.embedded import pretrained
 from extrags.restoration.diffusion.rectified_flow import sample
+from extrags.restoration.diffusion.weights import COLONS
 from extrags.stress.inputs import FARTHEST_OFFSET_MM, GAINS, IMAGES, SCALES, TURN, UPRIGHT, image, plane_views
 from extrags.stress.rows import (
     EPS,
@@ -198,9 +199,7 @@ def _layers(kind: str, height: int, width: int, *, unit: float = 1.0, hole: bool
 
 
 def _restored(layers: Layers, unit: float, *, half: bool, dtype: torch.dtype = torch.float32) -> list[Tensor]:
-    enhancer = pretrained(EnhanceConfig())
-    if enhancer is None:
-        raise FileNotFoundError("the bundled restorer is missing")
+    enhancer = pretrained(EnhanceConfig(pretrained_weights=COLONS))[0]
     transfer = LightTransfer(NearFieldLight.initial(1, 3 * unit), 0.0, 3 * unit)
     conditioning = condition(layers, transfer, folded=enhancer.network.folded)
     network = enhancer.network.to(dtype)

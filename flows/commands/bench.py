@@ -259,6 +259,12 @@ def _print_kernels(cases: list[dict[str, Any]]) -> None:
             )
 
 
+def _domain_line(case: dict[str, Any]) -> str:
+    weights = f"weights for {case['trained_on']}, " if case["trained_on"] else ""
+    place = "unlike" if case["domain_score"] > 1 else "like"
+    return f"{case['method']}: {weights}domain score {case['domain_score']:.2f}, {place} its training data"
+
+
 def _print_restorers(cases: list[dict[str, Any]]) -> None:
     """A table per sequence; what is kept of known texture is what fine-tuning is given."""
     from flows.terminal import console
@@ -277,12 +283,7 @@ def _print_restorers(cases: list[dict[str, Any]]) -> None:
         )
         for case in chosen:
             if case["domain_score"] is not None:
-                place = "unlike" if case["domain_score"] > 1 else "like"
-                console().print(
-                    f"{case['method']}: domain score {case['domain_score']:.2f}, {place} its training data",
-                    soft_wrap=True,
-                    markup=False,
-                )
+                console().print(_domain_line(case), soft_wrap=True, markup=False)
         rows = []
         for case in chosen:
             calibration, kept = case["calibration"], case["kept"]

@@ -125,7 +125,12 @@ def _add_training(parser: Parser) -> None:
         "--iterations", type=int, metavar="N", help="optimisation steps (default: 13500; 10000; 4000)"
     )
     parser.add_argument("--batch", type=int, metavar="N", help="crops per step (default: 4; 4; 8 views)")
-    parser.add_argument("--start", metavar="FOLDER", help="go on from these weights instead of from nothing")
+    parser.add_argument(
+        "--start",
+        metavar="FOLDER",
+        help="go on from these weights instead of from nothing: a folder, or a set of the package's (colons, "
+        "cavities)",
+    )
     parser.add_argument(
         "--learning-rate", type=float, metavar="X", help="the peak (default: 8e-4; 5e-4; 6e-4)"
     )
@@ -164,13 +169,13 @@ def _add_networks(parser: Parser) -> None:
         "--refiner",
         action="store_true",
         help="train the refiner of restored views instead of a restorer; --start names the restorer whose "
-        "views it refines (default: bundled). It keeps no checkpoint",
+        "views it refines (default: colons). It keeps no checkpoint",
     )
     parser.add_argument(
         "--hidden-depth",
         action="store_true",
         help="train the network that reads the depth of what a restored view has invented; the scenes are "
-        "explored, and --start names the restorer of their virtual views (default: bundled). It keeps no "
+        "explored, and --start names the restorer of their virtual views (default: colons). It keeps no "
         "checkpoint",
     )
 
@@ -188,7 +193,7 @@ def pretrain(given: argparse.Namespace) -> int:
     from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
     from extrags.restoration.diffusion.pretraining import PretrainingConfig, check_settings
     from extrags.restoration.diffusion.pretraining import pretrain as trained
-    from extrags.restoration.diffusion.weights import BUNDLED
+    from extrags.restoration.diffusion.weights import COLONS, starting_weights
     from extrags.restoration.hidden_depth.training import HiddenDepthConfig
     from extrags.restoration.refinement.training import RefinerConfig
     from flows.commands.pretrain_hidden_depth import (
@@ -214,12 +219,12 @@ def pretrain(given: argparse.Namespace) -> int:
     checked(given, config.scenes, config.validation_scenes, perceptual=perceptual)
     start = None
     if isinstance(config, HiddenDepthConfig):
-        begun = beginning(given.start or BUNDLED, config.completion)
+        begun = beginning(given.start or COLONS, config.completion)
     elif isinstance(config, RefinerConfig):
-        restorer = start_of_refiner(given.start or BUNDLED)
+        restorer = start_of_refiner(given.start or COLONS)
     else:
         if given.start is not None:
-            start = EmbeddedEnhancer.load(Path(given.start))
+            start = EmbeddedEnhancer.load(starting_weights(given.start))
         if not given.scenes_only:
             check_settings(config, start)
     # As things are now: in some hours the working tree may be another.

@@ -54,7 +54,7 @@ class Beginning:
     """What the training begins with.
 
     Args:
-        restorer: of the views that depth is read from: a folder with weights, or `bundled`.
+        restorer: of the views that depth is read from: a folder with weights, or a set of the package's.
         restorer_digest: of its weights.
         network: completes stereo.
         network_digest: of its weights.
@@ -70,21 +70,20 @@ def beginning(restorer: str, completion: str) -> Beginning:
     """Find both weights.
 
     Args:
-        restorer: a folder with weights, or `bundled`.
+        restorer: a folder with weights, or a set of the package's.
         completion: a file with weights of the depth completion, or `bundled`.
 
     Raises:
         ConfigError: where there is no such restorer, or no such completion.
     """
     from extrags.depth.weights import completion_digest, load_completion
-    from extrags.restoration.diffusion.weights import weights_digest
+    from extrags.restoration.diffusion.weights import starting_weights, weights_digest
 
     try:
-        digest = weights_digest(restorer)
+        starting_weights(restorer)
+        digest = str(weights_digest(restorer))
     except ExtragsError as error:
         raise ConfigError(f"--start {restorer}: {error}") from error
-    if digest is None:
-        raise ConfigError(f"--start {restorer}: depth is read from what a restorer has painted")
     try:
         network, network_digest = load_completion(completion), completion_digest(completion)
     except ExtragsError as error:
@@ -150,15 +149,15 @@ def make_views(source: SceneSource, file: Path, restorer: str, origin: str) -> N
     Args:
         source: of the scene.
         file: where they go.
-        restorer: a folder with weights, or `bundled`.
+        restorer: a folder with weights, or a set of the package's.
         origin: what they are made from.
     """
-    from extrags.config import EnhanceConfig, profile_config
-    from extrags.restoration.diffusion.embedded import pretrained
+    from extrags.config import profile_config
+    from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
+    from extrags.restoration.diffusion.weights import starting_weights
     from extrags.restoration.hidden_depth.examples import HiddenDepthExamples
 
-    enhancer = pretrained(EnhanceConfig(pretrained_weights=restorer))
-    assert enhancer is not None
+    enhancer = EmbeddedEnhancer.load(starting_weights(restorer))
     try:
         recording = source.recording(to_restore=False)
         made = HiddenDepthExamples.of_recording(recording, enhancer, profile_config("quick"), source.seed)

@@ -60,24 +60,21 @@ def start_of_refiner(start: str) -> RefinedRestorer:
     """Find the restorer whose views are to be refined.
 
     Args:
-        start: a folder with weights, or `bundled`.
+        start: a folder with weights, or the name of a set of the package's.
 
     Raises:
         ConfigError: where there are none.
     """
     from extrags.config import EnhanceConfig
-    from extrags.restoration.diffusion.embedded import pretrained
+    from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
     from extrags.restoration.diffusion.precision import chosen_precision
-    from extrags.restoration.diffusion.weights import weights_digest
+    from extrags.restoration.diffusion.weights import starting_weights, weights_digest
 
-    settings = EnhanceConfig(pretrained_weights=start)
     try:
-        restorer, digest = pretrained(settings), weights_digest(start)
+        restorer, digest = EmbeddedEnhancer.load(starting_weights(start)), str(weights_digest(start))
     except ExtragsError as error:
         raise ConfigError(f"--start {start}: {error}") from error
-    if restorer is None or digest is None:
-        raise ConfigError(f"--start {start}: a refiner needs a restorer whose views it refines")
-    half = chosen_precision(settings) == "bfloat16"
+    half = chosen_precision(EnhanceConfig()) == "bfloat16"
     return RefinedRestorer(replace(restorer, steps=1, half_precision=half), digest)
 
 

@@ -1,6 +1,6 @@
 """Restorers on views of many kinds of cavity, from the scenes that `extrags pretrain --scenes-only` makes.
 
-python -m tests.benchmarks.bench_restorer_kinds FOLDER --weights bundled other=OUT --mix 0.5 --views 8
+python -m tests.benchmarks.bench_restorer_kinds FOLDER --weights colons other=OUT --mix 0.5 --views 8
 
 Every scene file of the folder (or those of one family, `--family cavities`) is restored in one step without a
 judge: as rendered, by blending and filling, and by each of the weights, on at most so many of its views.
@@ -10,7 +10,7 @@ et al., "Robust fine-tuning of zero-shot models", CVPR 2022). Views of the first
 texture laid onto them, and refined.
 
 Weights must not have been trained on the scenes that they are compared on: `--last N` takes the last ones of
-each family, which a training keeps for validation. Bundled weights have never seen a cavity.
+each family, which a training keeps for validation. Those for colons have never seen a cavity.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from typing import Any
 import numpy as np
 
 from data_catalog.cavities.shapes import KINDS
-from extrags.config import EnhanceConfig
 from extrags.metrics.image import mean_of_known
 from extrags.metrics.lpips import Lpips
 from extrags.restoration.benchmark.evaluation import RestorerBenchmark, TrueViews
 from extrags.restoration.benchmark.variants import AsRendered, Textured
 from extrags.restoration.classical import ClassicalEnhancer
 from extrags.restoration.clips import as_images
-from extrags.restoration.diffusion.embedded import EmbeddedEnhancer, pretrained
+from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
+from extrags.restoration.diffusion.weights import starting_weights
 from extrags.restoration.protocol import Clip, Enhancer
 from extrags.restoration.refinement.weights import bundled_refiner
 from extrags.restoration.training_data.pretraining_scenes import PretrainingScene
@@ -50,7 +50,7 @@ def main() -> None:
     parser.add_argument(
         "--last", type=int, metavar="N", help="the last N scenes of each family; default: all"
     )
-    parser.add_argument("--weights", nargs="+", default=["bundled"], metavar="[NAME=]FOLDER")
+    parser.add_argument("--weights", nargs="+", default=["colons"], metavar="[NAME=]FOLDER")
     parser.add_argument("--mix", nargs="*", type=float, default=[], metavar="SHARE")
     parser.add_argument("--views", type=int, default=8, help="of each scene at most (default: 8)")
     parser.add_argument("--json", type=Path)
@@ -78,10 +78,7 @@ def _restorers(weights: list[str], shares: list[float]) -> Iterator[tuple[str, E
     loaded: list[EmbeddedEnhancer] = []
     for text in weights:
         name, _, place = text.rpartition("=")
-        found = pretrained(EnhanceConfig(pretrained_weights=place))
-        if found is None:
-            raise SystemExit(f"{text}: no weights")
-        loaded.append(replace(found, steps=1))
+        loaded.append(replace(EmbeddedEnhancer.load(starting_weights(place)), steps=1))
         yield name or place, loaded[-1]
     for share in shares:
         yield f"mean {share:g}", _mixed(loaded[0], loaded[1], share)

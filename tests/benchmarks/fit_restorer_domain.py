@@ -1,10 +1,11 @@
-"""Fit the domain of the bundled restorer: how the frames look that it was trained on.
+"""Fit the domain of the package's weights for colons: how the frames look that they were trained on.
 
     python -m tests.benchmarks.fit_restorer_domain [--trained 80] [--unseen 40] [--processes 2] [--write]
 
-The network is that of the package. Frames are those of its pretraining colons
+Frames are those of its pretraining colons
 (`data_catalog.phantom.pretraining`) from 0 on; colons from 1000 on, which nothing was trained on, set the
-limit. `--write` puts the domain into the package's `restorer.json`. Scores of sequences that are named behind
+limit. `--write` puts the domain into the package's `restorer.json`. Other weights are given theirs by
+`extrags pretrain`. Scores of sequences that are named behind
 `--score` are printed.
 """
 
@@ -39,7 +40,7 @@ def main() -> None:
     parser.add_argument("--score", nargs="*", default=[], metavar="SEQUENCE")
     parser.add_argument("--write", action="store_true")
     given = parser.parse_args()
-    from extrags.restoration.diffusion.weights import BUNDLED, find_weights
+    from extrags.restoration.diffusion.weights import COLONS, starting_weights
     from extrags.restoration.uncertainty.domain import Domain
 
     numbers = [*range(given.trained), *range(FIRST_UNSEEN, FIRST_UNSEEN + given.unseen)]
@@ -53,9 +54,7 @@ def main() -> None:
         print(f"{name}: {domain.score(features_of_sequence(name)):.2f}")
     if not given.write:
         return
-    weights = find_weights(BUNDLED)
-    assert weights is not None
-    file = weights.with_suffix(".json")
+    file = starting_weights(COLONS).with_suffix(".json")
     description = json.loads(file.read_text())
     rounded = {name: _rounded(value) for name, value in domain.as_dict().items()}
     place = "the domain's numbers"
@@ -86,12 +85,10 @@ def features_of_sequence(name: str) -> Float[np.ndarray, "n c"]:
 
 
 def _network() -> RestorationNetwork:
-    from extrags.config import profile_config
-    from extrags.restoration.diffusion.embedded import pretrained
+    from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
+    from extrags.restoration.diffusion.weights import COLONS, starting_weights
 
-    enhancer = pretrained(profile_config("quick").enhance)
-    assert enhancer is not None
-    return enhancer.network
+    return EmbeddedEnhancer.load(starting_weights(COLONS)).network
 
 
 def _rounded(value: object) -> object:

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from extrags.errors import ConfigError
-from extrags.restoration.diffusion.weights import BUNDLED, find_weights
+from extrags.restoration.diffusion.weights import COLONS, starting_weights
 from flows.budgets import Budget
 from flows.cli import main
 from flows.commands.bench_pipeline import grid_markdown
@@ -134,9 +134,7 @@ class TestGrid:
         scene.write_bytes(b"cOntent")
         assert [measured(SEQUENCE, **imported) for _ in range(2)] == [1, 0]
         weights = tmp_path / "weights"
-        bundled = find_weights(BUNDLED)
-        assert bundled is not None
-        shutil.copytree(bundled.parent, weights)
+        shutil.copytree(starting_weights(COLONS).parent, weights)
         own = {"enhance__pretrained_weights": str(weights)}
         assert [measured(SEQUENCE, **own) for _ in range(2)] == [1, 0]
         record = weights / "restorer.json"

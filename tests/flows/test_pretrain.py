@@ -214,16 +214,19 @@ def test_settings_that_do_not_fit_are_told_before_a_scene_is_made(
 
 
 def test_the_weights_of_the_package_say_where_they_come_from() -> None:
-    from extrags.restoration.diffusion.weights import find_weights
+    from extrags.restoration.diffusion.weights import BUNDLED, PACKAGED, find_weights
 
-    weights = find_weights("bundled")
-    assert weights is not None
-    record = json.loads(weights.with_suffix(".json").read_text())["record"]
-    assert record["command"].startswith("extrags pretrain ")
-    assert record["before"]["command"].startswith("extrags pretrain ")
-    scores = record["validation_scores"]
-    assert scores["embedded_1"]["psnr"] > scores["classical"]["psnr"] + 1
-    assert weights.stat().st_size < 8_000_000
+    found = find_weights(BUNDLED)
+    assert len(found) == len(PACKAGED)
+    for weights, name in zip(found, PACKAGED, strict=True):
+        description = json.loads(weights.with_suffix(".json").read_text())
+        assert description["trained_on"] == name
+        record = description["record"]
+        assert record["command"].startswith("extrags pretrain ")
+        assert record["before"]["command"].startswith("extrags pretrain ")
+        scores = record["validation_scores"]
+        assert scores["embedded_1"]["psnr"] > scores["classical"]["psnr"] + 1
+    assert sum(weights.stat().st_size for weights in found) < 25_000_000
 
 
 class TestRefiner:
@@ -274,7 +277,7 @@ class TestRefiner:
         small_scene(0).save(file)
         told: list[object] = []
         with subscribed(told.append):
-            assert examples_of([file], start_of_refiner("bundled")) == []
+            assert examples_of([file], start_of_refiner("colons")) == []
         assert told[-1] == Progress("refiner-examples", 1, 1)
 
     def test_wrong_settings_are_named(
@@ -285,7 +288,7 @@ class TestRefiner:
         assert "adversarial_weight" in capsys.readouterr().err
         assert main([*given, *out, "--learning-rate", "-1"]) == 2
         assert "learning_rate" in capsys.readouterr().err
-        for start in ("none", str(tmp_path / "typo")):
+        for start in ("none", "bundled", str(tmp_path / "typo")):
             assert main([*given, *out, "--start", start]) == 2
             assert f"--start {start}" in capsys.readouterr().err
         for option in ("--generative", "--deterministic", "--without-perceptual"):
@@ -360,7 +363,7 @@ class TestHiddenDepth:
         assert "slope_weight" in capsys.readouterr().err
         assert main([*given, *out, "--learning-rate", "-1"]) == 2
         assert "learning_rate" in capsys.readouterr().err
-        for start in ("none", str(tmp_path / "typo")):
+        for start in ("none", "bundled", str(tmp_path / "typo")):
             assert main([*given, *out, "--start", start]) == 2
             assert f"--start {start}" in capsys.readouterr().err
         for completion in ("none", str(tmp_path / "typo")):

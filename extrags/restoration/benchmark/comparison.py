@@ -250,9 +250,9 @@ def compare_methods(
         lpips: LPIPS by backbone; None leaves it out.
 
     Returns:
-        One case per method: `{sequence, seed, method, steps, domain_score, psnr, ssim, lpips_alex, well,
-        hole, ..., seconds_per_frame, prepare_seconds, keyframes, keyframe_seconds, pixel_share, views}`; see
-        `RestorerBenchmark.figures`.
+        One case per method: `{sequence, seed, method, steps, domain_score, trained_on, psnr, ssim,
+        lpips_alex, well, hole, ..., seconds_per_frame, prepare_seconds, keyframes, keyframe_seconds,
+        pixel_share, views}`; see `RestorerBenchmark.figures`.
 
     Raises:
         CaptureError: without held-out frames, or too few to train on.
@@ -283,6 +283,7 @@ def compare_methods(
                 "method": name,
                 "steps": restored.provenance.get("steps"),
                 "domain_score": restored.provenance.get("domain_score"),
+                "trained_on": restored.provenance.get("trained_on"),
                 **figures,
                 "prepare_seconds": seconds,
                 "keyframes": len(keyframes),

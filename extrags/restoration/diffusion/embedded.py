@@ -46,16 +46,18 @@ from extrags.view_synthesis.references import LightTransfer
 
 __all__ = ["EmbeddedEnhancer", "pretrained"]
 
-FORMAT = 5
+FORMAT = 6
 """Raised when a saved restorer cannot be read by newer code."""
 _UNKNOWN_DOMAIN: dict[str, Any] = {"domain": None, "domain_score": None, "scene_calibrated": False}
 EARLIER_FORMATS: dict[int, dict[str, Any]] = {
-    2: {"generative": False, "drawing": False, "depth_from_image": None},
-    3: {"depth_from_image": None},
-    4: {},
+    2: {"generative": False, "drawing": False, "depth_from_image": None, "trained_on": ""},
+    3: {"depth_from_image": None, "trained_on": ""},
+    4: {"trained_on": ""},
+    5: {"trained_on": ""},
 }
-"""What earlier formats that can be read lack, and what stands for it; their domain, of other features, is not
-read."""
+"""What earlier formats that can be read lack, and what stands for it."""
+FIRST_DOMAIN_FORMAT = 5
+"""Domains of earlier formats are of other features, and not read."""
 PATCHES = "patches.safetensors"
 UNTRAINED = "untrained"
 """Folder inside that of a restorer."""
@@ -95,6 +97,7 @@ class EmbeddedEnhancer:
         depth_from_image: depth in holes is read from the restored image.
         untrained: what the restorer was before it was trained on the scene; None where it was not, or began
             with nothing.
+        trained_on: kind of scene that its weights have learned from, for reports; empty if unknown.
     """
 
     network: RestorationNetwork
@@ -114,6 +117,7 @@ class EmbeddedEnhancer:
     domain_score: float | None = None
     scene_calibrated: bool = False
     untrained: EmbeddedEnhancer | None = None
+    trained_on: str = ""
 
     name = "embedded"
     follows_keyframes = True
@@ -282,6 +286,7 @@ class EmbeddedEnhancer:
             "precision": "bfloat16" if self.half_precision else "float32",
             "drawing": self.drawing,
             "depth_from_image": self.depth_from_image,
+            "trained_on": self.trained_on,
             "domain_score": self.domain_score,
             "validation": self.record.get("validation", {}),
             "scene_training_kept": self.record.get("scene_training_kept"),
@@ -330,6 +335,7 @@ class EmbeddedEnhancer:
             "domain": None if self.domain is None else self.domain.as_dict(),
             "domain_score": self.domain_score,
             "scene_calibrated": self.scene_calibrated,
+            "trained_on": self.trained_on,
             "record": self.record,
         }
         write_description(path, description)
@@ -352,7 +358,8 @@ class EmbeddedEnhancer:
         channels = description.get("condition_channels")
         for number, entries in EARLIER_FORMATS.items():
             if description.get("format") == number:
-                description = entries | description | _UNKNOWN_DOMAIN
+                unread = _UNKNOWN_DOMAIN if number < FIRST_DOMAIN_FORMAT else {}
+                description = entries | description | unread
         if description.get("format") not in (*EARLIER_FORMATS, FORMAT) or (
             channels not in CHANNELS_OF_NETWORKS
         ):
@@ -389,6 +396,7 @@ class EmbeddedEnhancer:
                 None if description["domain_score"] is None else float(description["domain_score"]),
                 bool(description["scene_calibrated"]),
                 _read_untrained(weights_file.with_name(UNTRAINED)),
+                str(description["trained_on"]),
             )
         try:
             network.load_state_dict(
@@ -427,16 +435,16 @@ def _read_untrained(folder: Path) -> EmbeddedEnhancer | None:
     return EmbeddedEnhancer.load(folder) if folder.is_dir() else None
 
 
-def pretrained(config: EnhanceConfig) -> EmbeddedEnhancer | None:
-    """The restorer with pretrained weights; None where training starts from random ones.
+def pretrained(config: EnhanceConfig) -> tuple[EmbeddedEnhancer, ...]:
+    """Restorers with pretrained weights, the first preferred; none where training starts from random ones.
 
     Raises:
         WeightsError: when the weights are missing or do not fit.
         ConfigError: when there would be neither weights nor training.
     """
     weights = find_weights(config.pretrained_weights)
-    if weights is None and config.train_iterations == 0:
+    if not weights and config.train_iterations == 0:
         raise ConfigError(
             "enhance.train_iterations is 0 and enhance.pretrained_weights is none: nothing would restore"
         )
-    return None if weights is None else EmbeddedEnhancer.load(weights)
+    return tuple(map(EmbeddedEnhancer.load, weights))

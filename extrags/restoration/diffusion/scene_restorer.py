@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -15,7 +16,12 @@ from extrags.restoration.diffusion.embedded import EmbeddedEnhancer, pretrained
 from extrags.restoration.diffusion.error_fit import error_over_expected, with_calibration
 from extrags.restoration.diffusion.patches import choose_patches
 from extrags.restoration.diffusion.scene_training import train_on_scene
-from extrags.restoration.diffusion.validation import restored_pairs, scores_of, validation_pairs
+from extrags.restoration.diffusion.validation import (
+    RestoredPairs,
+    restored_pairs,
+    scores_of,
+    validation_pairs,
+)
 from extrags.restoration.protocol import Enhancer
 from extrags.restoration.training_data.pairs import Pairs, make_pairs
 from extrags.restoration.uncertainty.calibration import Calibration
@@ -26,7 +32,7 @@ from extrags.view_synthesis.gamut import Frame, Gamut
 from extrags.view_synthesis.gather import gather_references
 from extrags.view_synthesis.references import LightTransfer
 
-__all__ = ["better_of_both", "by_domain", "scene_restorer"]
+__all__ = ["best_of_all", "by_domain", "familiar", "scene_restorer"]
 
 MAX_LOSS_DB = 0.5
 """A PSNR lower by up to so much is accepted: leave-out views are near the path, with little to restore."""
@@ -45,49 +51,65 @@ def scene_restorer(
         WeightsError: when the weights are missing or do not fit.
         ConfigError: when there would be neither weights nor training.
     """
-    start = pretrained(config)
+    known = familiar([found.with_domain_score(sequence) for found in pretrained(config)])
+    start = known[0] if known else None
     transfer = gather_references(scene, sequence, sequence.train).transfer
     patches = choose_patches(sequence) if start is not None and start.network.generative else None
     if start is not None:
-        start = start.with_domain_score(sequence)
         _tell_domain(start)
     if start is not None and config.train_iterations == 0:
-        untouched = start.with_settings(config, _scene_gamut(sequence), patches)
+        gamut = _scene_gamut(sequence)
+        untouched = [restorer.with_settings(config, gamut, patches) for restorer in known]
         if not config.judge:
-            return untouched
+            return untouched[0]
         if len(sequence.train) < MIN_FRAMES:
             return by_domain(
-                untouched, f"{len(sequence.train)} training frames are too few to leave some out"
+                untouched[0], f"{len(sequence.train)} training frames are too few to leave some out"
             )
         # Nothing is trained, so all leave-out pairs validate; synthetic ones would favour filling holes.
         leave_out = config.model_copy(update={"synthetic_views": 0})
         fresh = make_pairs(scene, sequence, leave_out, coarse, most=config.judge_pairs)
         pairs = replace(fresh, validation=np.ones(len(fresh), dtype=bool))
         # How far off it is differs more from scene to scene than where.
-        return better_of_both(untouched, pairs, transfer, calibrate=True)
+        return best_of_all(untouched, pairs, transfer, calibrate=True)
     pairs = make_pairs(scene, sequence, config, coarse)
     trained = train_on_scene(pairs, transfer, config, start, patches=patches)
     if not config.judge:
         return trained
     weights = Calibration() if start is None else start.calibration
-    return better_of_both(trained, pairs, transfer, of_weights=weights)
+    return best_of_all([trained], pairs, transfer, of_weights=weights)
 
 
-def better_of_both(
-    enhancer: EmbeddedEnhancer,
+def familiar(restorers: Sequence[EmbeddedEnhancer]) -> list[EmbeddedEnhancer]:
+    """Those of the restorers that come into question for a scene, the most familiar with it first.
+
+    Args:
+        restorers: the first is preferred; with their domain scores, where these are known.
+
+    Returns:
+        The first that knows the scene alone; where none does, all of them.
+    """
+    for restorer in restorers:
+        if restorer.domain_score is None or restorer.domain_score <= 1:
+            return [restorer]
+    return sorted(restorers, key=lambda restorer: restorer.domain_score or 0.0)
+
+
+def best_of_all(
+    restorers: Sequence[EmbeddedEnhancer],
     pairs: Pairs,
     transfer: LightTransfer,
     *,
     calibrate: bool = False,
     of_weights: Calibration | None = None,
 ) -> Enhancer:
-    """The restorer, or the classical one where that is clearly better on the scene's validation pairs.
+    """The best restorer, or the classical one where that is clearly better on the scene's validation pairs.
 
     On scenes unlike its training data a network can do harm; the classical restorer then replaces it, and
     carries the reason.
 
     Args:
-        enhancer: ready for the scene.
+        restorers: ready for the scene, at least one; the first serves where there is no validation pair.
         pairs: those for validation were not trained on.
         transfer: how brightness changes with distance.
         calibrate: fit the expected error of the restorer that is kept to these pairs.
@@ -96,11 +118,11 @@ def better_of_both(
     """
     chosen = validation_pairs(pairs)
     if not bool((pairs.weight > 0).any()):
-        return by_domain(enhancer, "no left-out frame has a valid pixel")
-    # By their means: a drawn view has texture of its own, which costs PSNR wherever it is right.
-    means = restored_pairs(replace(enhancer, drawing=False), chosen or pairs, transfer)
-    scores = scores_of([means], transfer)
-    restored, filled = scores[means.name]["psnr"], scores["classical"]["psnr"]
+        return by_domain(restorers[0], "no left-out frame has a valid pixel")
+    trials = [_Trial.of(restorer, chosen or pairs, transfer) for restorer in restorers]
+    best = max(trials, key=lambda trial: trial.restored_db)
+    enhancer, means, scores = best.restorer, best.means, best.scores
+    restored, filled = best.restored_db, scores["classical"]["psnr"]
     emit(MetricRecorded("enhance", "judged_gain_over_classical_db", restored - filled))
     shown = restored_pairs(enhancer, means.pairs, transfer) if enhancer.drawing else means
     # Without validation pairs nothing tells of errors: the restorer was trained on these.
@@ -126,6 +148,25 @@ def better_of_both(
     validation = {**enhancer.record.get("validation", {}), **scores}
     kept = replace(enhancer, record={**enhancer.record, "validation": validation, "judged": judged})
     return with_calibration(kept, shown) if calibrate and chosen is not None else kept
+
+
+@dataclass(frozen=True)
+class _Trial:
+    """A restorer, its means of pairs, and the scores of these."""
+
+    restorer: EmbeddedEnhancer
+    means: RestoredPairs
+    scores: dict[str, dict[str, float]]
+
+    @classmethod
+    def of(cls, restorer: EmbeddedEnhancer, pairs: Pairs, transfer: LightTransfer) -> _Trial:
+        # By their means: a drawn view has texture of its own, which costs PSNR wherever it is right.
+        means = restored_pairs(replace(restorer, drawing=False), pairs, transfer)
+        return cls(restorer, means, scores_of([means], transfer))
+
+    @property
+    def restored_db(self) -> float:
+        return self.scores[self.means.name]["psnr"]
 
 
 def by_domain(enhancer: EmbeddedEnhancer, unjudged: str) -> Enhancer:

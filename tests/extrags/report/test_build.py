@@ -145,6 +145,10 @@ def test_how_the_restorer_was_judged_is_told(inputs: ReportInputs, html: str) ->
             "The network was left out: on left-out frames of this scene it reaches 20.00 dB, 6.00 dB less",
         ),
         ({"backend": "classical"}, "Restored by classical."),
+        (
+            {"backend": "embedded", "judged": judged, "trained_on": "colons"},
+            "Restored by embedded, weights for colons. On left-out",
+        ),
         ({"backend": "classical", "reason": "why"}, "Restored by blending and filling: why."),
     ):
         pseudo = replace(inputs.pseudo, provenance=provenance)

@@ -27,7 +27,7 @@ from extrags.restoration.diffusion.network_training import (
     train_network,
 )
 from extrags.restoration.diffusion.rectified_flow import Predicted, sample
-from extrags.restoration.diffusion.scene_restorer import better_of_both
+from extrags.restoration.diffusion.scene_restorer import best_of_all, familiar
 from extrags.restoration.diffusion.scene_training import train_on_scene
 from extrags.restoration.diffusion.validation import restored_pairs, validation_pairs
 from extrags.restoration.protocol import Clip, Enhancer, never_trained_on
@@ -295,14 +295,14 @@ class TestEmbedded:
         self, tube: Tube, tube_pairs: Pairs, trained: EmbeddedEnhancer, clip: Clip, tmp_path, caplog
     ) -> None:
         transfer = tube.references.transfer
-        kept = better_of_both(trained, tube_pairs, transfer)
+        kept = best_of_all([trained], tube_pairs, transfer)
         assert isinstance(kept, EmbeddedEnhancer)
         assert f"embedded_{trained.steps}" in kept.provenance["validation"]
         told = kept.provenance["judged"]
         assert told["restored_db"] > told["filled_db"]
         network = copy.deepcopy(trained.network)
         torch.nn.init.normal_(network.exit.weight, std=0.3, generator=torch.Generator().manual_seed(3))
-        served = better_of_both(replace(trained, network=network), tube_pairs, transfer)
+        served = best_of_all([replace(trained, network=network)], tube_pairs, transfer)
         assert isinstance(served, ClassicalEnhancer)
         assert "restored by blending and filling" in caplog.text
         served.save(tmp_path)
@@ -316,7 +316,7 @@ class TestEmbedded:
     ) -> None:
         hidden = replace(tube_pairs, weight=torch.zeros_like(tube_pairs.weight))
         assert validation_pairs(hidden) is None
-        assert better_of_both(trained, hidden, tube.references.transfer) is trained
+        assert best_of_all([trained], hidden, tube.references.transfer) is trained
 
     def test_unjudged_it_serves_familiar_scenes_alone(
         self, trained: EmbeddedEnhancer, tube_pairs: Pairs, tube: Tube, clip: Clip, tmp_path, caplog
@@ -324,14 +324,49 @@ class TestEmbedded:
         transfer = tube.references.transfer
         hidden = replace(tube_pairs, weight=torch.zeros_like(tube_pairs.weight))
         familiar, strange = (replace(trained, domain_score=score) for score in (0.9, 2.5))
-        assert better_of_both(familiar, hidden, transfer) is familiar
-        served = better_of_both(strange, hidden, transfer)
+        assert best_of_all([familiar], hidden, transfer) is familiar
+        served = best_of_all([strange], hidden, transfer)
         assert isinstance(served, ClassicalEnhancer)
         assert "no left-out frame has a valid pixel" in caplog.text
         served.save(tmp_path)
         provenance = load_enhancer(tmp_path).restore(clip).provenance
         assert "2.5 times as far" in provenance["reason"]
         assert provenance["domain_score"] == 2.5
+
+    @pytest.mark.parametrize(
+        ("scores", "expected"),
+        [
+            ([0.7, 0.4], [0.7]),
+            ([1.2, 0.9], [0.9]),
+            ([None, 0.9], [None]),
+            ([2.5, 1.5], [1.5, 2.5]),
+            ([1.5, 2.5], [1.5, 2.5]),
+            ([3.0], [3.0]),
+            ([], []),
+        ],
+    )
+    def test_weights_that_know_the_scene_come_into_question_and_all_where_none_do(
+        self, trained: EmbeddedEnhancer, scores: list[float | None], expected: list[float | None]
+    ) -> None:
+        given = [replace(trained, domain_score=score) for score in scores]
+        assert [restorer.domain_score for restorer in familiar(given)] == expected
+
+    def test_of_several_weights_the_judge_takes_the_best(
+        self, trained: EmbeddedEnhancer, tube_pairs: Pairs, tube: Tube
+    ) -> None:
+        network = copy.deepcopy(trained.network)
+        torch.nn.init.normal_(network.exit.weight, std=0.3, generator=torch.Generator().manual_seed(3))
+        worse = replace(trained, network=network, trained_on="noise", domain_score=1.2)
+        better = replace(trained, trained_on="tubes", domain_score=1.4)
+        transfer = tube.references.transfer
+        for given in ([worse, better], [better, worse]):
+            kept = best_of_all(given, tube_pairs, transfer)
+            assert isinstance(kept, EmbeddedEnhancer)
+            assert kept.provenance["trained_on"] == "tubes"
+            assert kept.provenance["domain_score"] == 1.4
+            alone = best_of_all([better], tube_pairs, transfer)
+            assert isinstance(alone, EmbeddedEnhancer)
+            assert kept.record["judged"] == alone.record["judged"]
 
     @pytest.mark.parametrize(("lost_db", "score", "kept"), [(0.3, 0.9, True), (0.3, 1.1, False)])
     def test_on_unfamiliar_scenes_no_loss_is_tolerated(
@@ -346,7 +381,7 @@ class TestEmbedded:
     ) -> None:
         scores = {f"embedded_{trained.steps}": {"psnr": 20.0}, "classical": {"psnr": 20.0 + lost_db}}
         monkeypatch.setattr(scene_restorer, "scores_of", lambda *_: scores)
-        served = better_of_both(replace(trained, domain_score=score), tube_pairs, tube.references.transfer)
+        served = best_of_all([replace(trained, domain_score=score)], tube_pairs, tube.references.transfer)
         assert isinstance(served, EmbeddedEnhancer) == kept
 
     def test_with_too_few_frames_to_leave_out_unfamiliar_scenes_are_filled(
@@ -399,7 +434,7 @@ class TestEmbedded:
         served = train_enhancer(tube.scene, tube.sequence, SMALL.model_copy(update=harmful), CoarseConfig())
         assert isinstance(served, EmbeddedEnhancer)
         assert served.calibration != sure.calibration
-        untouched = better_of_both(sure, tube_pairs, tube.references.transfer)
+        untouched = best_of_all([sure], tube_pairs, tube.references.transfer)
         assert isinstance(untouched, EmbeddedEnhancer)
         ratios = [each.record["judged"]["error_over_expected"] for each in (served, untouched)]
         assert ratios[0] == pytest.approx(ratios[1], rel=1e-2) != pytest.approx(1, rel=0.5)
@@ -418,13 +453,13 @@ class TestEmbedded:
         monkeypatch.setattr(EmbeddedEnhancer, "restored_layers", counted)
         transfer = tube.references.transfer
         plain = replace(trained, calibration=Calibration())
-        kept = better_of_both(plain, tube_pairs, transfer, calibrate=True)
+        kept = best_of_all([plain], tube_pairs, transfer, calibrate=True)
         chosen = validation_pairs(tube_pairs)
         assert chosen is not None
         assert count == len(chosen)
         assert isinstance(kept, EmbeddedEnhancer)
         assert kept.calibration == Calibration.fitted(*cell_errors(restored_pairs(plain, chosen, transfer)))
-        assert better_of_both(plain, tube_pairs, transfer).calibration == plain.calibration
+        assert best_of_all([plain], tube_pairs, transfer).calibration == plain.calibration
 
     @pytest.mark.parametrize(("most", "expected"), [(48, 20), (8, 8)])
     def test_no_more_pairs_are_judged_than_tell_something(
@@ -433,12 +468,14 @@ class TestEmbedded:
         trained.save(tmp_path, half=True)
         judged: list[Pairs] = []
 
-        def keep(enhancer: EmbeddedEnhancer, pairs: Pairs, _: object, *, calibrate: bool) -> EmbeddedEnhancer:
+        def keep(
+            enhancers: list[EmbeddedEnhancer], pairs: Pairs, _: object, *, calibrate: bool
+        ) -> EmbeddedEnhancer:
             assert calibrate
             judged.append(pairs)
-            return enhancer
+            return enhancers[0]
 
-        monkeypatch.setattr(scene_restorer, "better_of_both", keep)
+        monkeypatch.setattr(scene_restorer, "best_of_all", keep)
         settings = {
             "train_iterations": 0,
             "pretrained_weights": str(tmp_path),

@@ -11,18 +11,16 @@ import torch
 from data_catalog.phantom.imaging import recording_sensor
 from data_catalog.phantom.pretraining import pretraining_scene_config
 from data_catalog.phantom.recording import TRAINS, Phantom
-from extrags.config import EnhanceConfig
-from extrags.restoration.diffusion.embedded import EmbeddedEnhancer, pretrained
+from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.diffusion.frame_features import FRAMES, frame_features, sequence_features
 from extrags.restoration.diffusion.network import RestorationNetwork
+from extrags.restoration.diffusion.weights import COLONS, starting_weights
 from tests.extrags.lit_tube import Tube
 
 
 @pytest.fixture(scope="module")
 def bundled() -> EmbeddedEnhancer:
-    enhancer = pretrained(EnhanceConfig())
-    assert enhancer is not None
-    return enhancer
+    return EmbeddedEnhancer.load(starting_weights(COLONS))
 
 
 @pytest.fixture(scope="module")

@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from extrags.config import EnhanceConfig, PipelineConfig, profile_config
+from extrags.config import PipelineConfig, profile_config
 from extrags.depth.completion import SEEN, STEREO
 from extrags.depth.hidden import SOLID
 from extrags.depth.weights import load_completion
 from extrags.errors import CaptureError, ConfigError, WeightsError
-from extrags.restoration.diffusion.embedded import EmbeddedEnhancer, pretrained
+from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.hidden_depth import training as training_module
 from extrags.restoration.hidden_depth.examples import HiddenDepthExamples
 from extrags.restoration.hidden_depth.training import (
@@ -36,8 +36,7 @@ def settings() -> PipelineConfig:
 
 
 def restorer() -> EmbeddedEnhancer:
-    found = pretrained(EnhanceConfig(precision="float32"))
-    assert found is not None
+    found = EmbeddedEnhancer.load(starting_weights(COLONS))
     return replace(found, steps=1, half_precision=False)
 
 

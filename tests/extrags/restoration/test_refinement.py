@@ -10,10 +10,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from extrags.config import EnhanceConfig
 from extrags.errors import CaptureError, ConfigError, WeightsError
 from extrags.metrics.lpips import Lpips
-from extrags.restoration.diffusion.embedded import pretrained
 from extrags.restoration.diffusion.network import build_network
 from extrags.restoration.refinement import refiner as refiner_module
 from extrags.restoration.refinement import training as training_module
@@ -191,8 +189,7 @@ class TestTexturedViews:
 @pytest.fixture(scope="module")
 def examples() -> RefinementExamples:
     scene = replace(small_scene(0), texture=tiles())
-    restorer = pretrained(EnhanceConfig())
-    assert restorer is not None
+    restorer = EmbeddedEnhancer.load(starting_weights(COLONS))
     return RefinementExamples.of_scene(scene, replace(restorer, steps=1))
 
 
@@ -204,8 +201,7 @@ class TestExamples:
         assert float((first != second)[invented].float().mean()) > 0.9
 
     def test_a_scene_without_texture_is_refused(self) -> None:
-        restorer = pretrained(EnhanceConfig())
-        assert restorer is not None
+        restorer = EmbeddedEnhancer.load(starting_weights(COLONS))
         with pytest.raises(CaptureError, match="gives texture"):
             RefinementExamples.of_scene(small_scene(0), restorer)
 
@@ -233,8 +229,7 @@ class TestExamples:
     def test_a_restorer_that_draws_gives_its_mean(self) -> None:
         """The views to refine are smooth ones."""
         scene = replace(small_scene(0), texture=tiles())
-        restorer = pretrained(EnhanceConfig())
-        assert restorer is not None
+        restorer = EmbeddedEnhancer.load(starting_weights(COLONS))
         network = restorer.network.widened(CONDITION_CHANNELS + INVENTED_CHANNELS)
         torch.nn.init.ones_(network.drawing.weight)
         drawing = replace(restorer, network=network, steps=1, drawing=True, half_precision=False)

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from extrags.errors import WeightsError
+from extrags.errors import ConfigError, WeightsError
 from extrags.restoration.diffusion import weights
-from extrags.restoration.diffusion.weights import find_weights, weights_digest
+from extrags.restoration.diffusion.weights import PACKAGED, find_weights, starting_weights, weights_digest
 
 
 @pytest.fixture
@@ -23,13 +23,13 @@ def pair(tmp_path: Path) -> Path:
 
 
 def test_none_is_none() -> None:
-    assert find_weights("none") is None
+    assert find_weights("none") == ()
     assert weights_digest("none") is None
 
 
 def test_a_file_and_its_folder_are_the_same(pair: Path) -> None:
     file = pair / "restorer.safetensors"
-    assert find_weights(str(file)) == find_weights(str(pair)) == file
+    assert find_weights(str(file)) == find_weights(str(pair)) == (file,)
     assert weights_digest(str(file)) == weights_digest(str(pair))
 
 
@@ -51,11 +51,26 @@ def test_the_digest_is_of_the_content_and_not_of_the_place(pair: Path, tmp_path:
 
 def test_the_packages_own_are_found_beside_the_code(pair: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert Path(str(weights.files(weights.__name__))) == Path(weights.__file__).parent
+    package = pair.parent / "package"
+    for name in PACKAGED:
+        shutil.copytree(pair, package / name)
+        (package / name / "restorer.json").write_text(f'{{"name": "{name}"}}')
     monkeypatch.setattr(
-        weights, "files", lambda package: {"extrags.restoration.diffusion.weights": pair}[package]
+        weights, "files", lambda name: {"extrags.restoration.diffusion.weights": package}[name]
     )
-    assert find_weights("bundled") == pair / "restorer.safetensors"
-    assert weights_digest("bundled") == weights_digest(str(pair))
+    own = tuple(package / name / "restorer.safetensors" for name in PACKAGED)
+    assert find_weights("bundled") == own
+    for name, file in zip(PACKAGED, own, strict=True):
+        assert find_weights(name) == (file,)
+        assert starting_weights(name) == file
+        assert weights_digest(name) == weights_digest(str(package / name))
+    assert len({weights_digest(setting) for setting in ("bundled", *PACKAGED)}) == 1 + len(PACKAGED)
+
+
+@pytest.mark.parametrize("setting", ["bundled", "none"])
+def test_a_training_begins_with_one_set(setting: str) -> None:
+    with pytest.raises(ConfigError, match=f"{setting}: expected one set of weights: colons, cavities, or"):
+        starting_weights(setting)
 
 
 def test_an_incomplete_installation_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -63,7 +78,8 @@ def test_an_incomplete_installation_is_told(tmp_path: Path, monkeypatch: pytest.
     with pytest.raises(WeightsError) as caught:
         find_weights("bundled")
     assert str(caught.value) == (
-        f"enhance.pretrained_weights=bundled: there is no file {tmp_path / 'restorer.safetensors'}; this "
+        "enhance.pretrained_weights=colons: there is no file "
+        f"{tmp_path / 'colons' / 'restorer.safetensors'}; this "
         "installation is incomplete: reinstall extrags, or set enhance.pretrained_weights=none"
     )
 
@@ -77,5 +93,6 @@ def test_a_named_file_that_is_missing_is_told(pair: Path, missing: str) -> None:
     assert str(caught.value) == (
         f"enhance.pretrained_weights={named}: there is no file {pair / missing}; expected a .safetensors "
         "file with its .json beside it, or a folder that holds restorer.safetensors and restorer.json; "
-        "bundled takes the weights of the package, none trains from nothing"
+        "bundled takes the weights of the package, colons or cavities one set of them, none trains from "
+        "nothing"
     )

@@ -1,7 +1,8 @@
 """Pretrained weights of the embedded restorer: those of the package, or a user's own.
 
-`restorer.safetensors` beside this file was trained by this project; `restorer.json` records the command,
-the data and the scores. A user's own pair of such files is given by its path.
+Both sets of the package were trained by this project: `colons` on the phantom's family, `cavities` on many
+kinds of cavity in tissue of any colour. Their `restorer.json` record the commands, the data and the scores. A
+user's own pair of such files is given by its path.
 """
 
 from __future__ import annotations
@@ -11,44 +12,65 @@ from collections.abc import Iterable
 from importlib.resources import files
 from pathlib import Path
 
-from extrags.errors import WeightsError
+from extrags.errors import ConfigError, WeightsError
 from extrags.restoration.description import DESCRIPTION
 from extrags.user_paths import expanded
 
-__all__ = ["BUNDLED", "NONE", "WEIGHTS", "files_digest", "find_weights", "weights_digest"]
+__all__ = [
+    "BUNDLED",
+    "COLONS",
+    "NONE",
+    "PACKAGED",
+    "WEIGHTS",
+    "files_digest",
+    "find_weights",
+    "starting_weights",
+    "weights_digest",
+]
 
 BUNDLED = "bundled"
-"""Setting: the weights of the package."""
+"""Setting: the weights of the package, of which each scene takes those that know it."""
+COLONS = "colons"
+PACKAGED = (COLONS, "cavities")
+"""Settings: one set of the package's weights, whatever the scene."""
 NONE = "none"
 """Setting: no weights; the restorer of a scene is trained from random ones."""
 WEIGHTS = "restorer.safetensors"
 
 
-def find_weights(setting: str) -> Path | None:
-    """File of the weights that a scene's restorer starts from.
+def find_weights(setting: str) -> tuple[Path, ...]:
+    """Files of the weights that a scene's restorer may start from.
 
     Args:
-        setting: `bundled`, `none`, or the path of a .safetensors file with its .json beside it, or of a
-            folder that holds `restorer.safetensors` and `restorer.json` (a saved restorer is one).
+        setting: `bundled`, one of `PACKAGED`, `none`, or the path of a .safetensors file with its .json
+            beside it, or of a folder that holds `restorer.safetensors` and `restorer.json` (a saved restorer
+            is one).
 
     Returns:
-        The .safetensors file, its description beside it with the suffix .json; None for `none`.
+        The .safetensors files, the description of each beside it with the suffix .json: all that the package
+        has for `bundled`, the first preferred; one for other weights; none for `none`.
 
     Raises:
         WeightsError: when a file is missing or another kind is named; says what to do.
     """
     if setting == NONE:
-        return None
+        return ()
     if setting == BUNDLED:
-        weights = Path(str(files(__name__))) / WEIGHTS
+        return tuple(_find_one(name) for name in PACKAGED)
+    return (_find_one(setting),)
+
+
+def _find_one(setting: str) -> Path:
+    if setting in PACKAGED:
+        weights = Path(str(files(__name__))) / setting / WEIGHTS
         cure = f"this installation is incomplete: reinstall extrags, or set enhance.pretrained_weights={NONE}"
     else:
         given = expanded(setting)
         weights = given / WEIGHTS if given.is_dir() else given
         cure = (
             "expected a .safetensors file with its .json beside it, or a folder that holds "
-            f"{WEIGHTS} and {DESCRIPTION}; {BUNDLED} takes the weights of the package, {NONE} trains from "
-            "nothing"
+            f"{WEIGHTS} and {DESCRIPTION}; {BUNDLED} takes the weights of the package, "
+            f"{' or '.join(PACKAGED)} one set of them, {NONE} trains from nothing"
         )
     for file in (weights, weights.with_suffix(".json")):
         if not file.is_file():
@@ -58,16 +80,31 @@ def find_weights(setting: str) -> Path | None:
     return weights
 
 
+def starting_weights(setting: str) -> Path:
+    """File of the one set of weights that a training begins with.
+
+    Args:
+        setting: as `find_weights`.
+
+    Raises:
+        WeightsError: as `find_weights`.
+        ConfigError: when there is none, or a choice of several.
+    """
+    found = find_weights(setting)
+    if len(found) != 1:
+        raise ConfigError(f"{setting}: expected one set of weights: {', '.join(PACKAGED)}, or a folder")
+    return found[0]
+
+
 def weights_digest(setting: str) -> str | None:
     """Digest of weights and description, independent of their path; None without weights.
 
     Raises:
         WeightsError: as `find_weights`.
     """
-    weights = find_weights(setting)
-    if weights is None:
-        return None
-    return files_digest((weights, weights.with_suffix(".json")))
+    found = find_weights(setting)
+    files = [file for weights in found for file in (weights, weights.with_suffix(".json"))]
+    return files_digest(files) if files else None
 
 
 def files_digest(files: Iterable[Path]) -> str:
