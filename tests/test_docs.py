@@ -140,7 +140,7 @@ def test_licences_name_whatever_is_bundled() -> None:
     """Every file of weights, and the pictures of each sequence."""
     text = (REPOSITORY / "docs/licences.md").read_text()
     files = [*(REPOSITORY / "extrags").rglob("*.safetensors"), REPOSITORY / ".github/overview.jpg"]
-    assert len(files) == 5
+    assert len(files) == 6
     wanted = {file.relative_to(REPOSITORY).as_posix() for file in files}
     for folder in {file.parent for file in (REPOSITORY / "docs").rglob("*.jpg")}:
         here = folder.relative_to(REPOSITORY).as_posix()

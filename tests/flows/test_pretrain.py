@@ -225,7 +225,9 @@ def test_the_weights_of_the_package_say_where_they_come_from() -> None:
         assert record["command"].startswith("extrags pretrain ")
         assert record["before"]["command"].startswith("extrags pretrain ")
         scores = record["validation_scores"]
-        assert scores["embedded_1"]["psnr"] > scores["classical"]["psnr"] + 1
+        restored, filled = scores["embedded_1"], scores["classical"]
+        assert restored["psnr"] > filled["psnr"]
+        assert restored["psnr_hole"] > filled["psnr_hole"] + 0.5
     assert sum(weights.stat().st_size for weights in found) < 25_000_000
 
 

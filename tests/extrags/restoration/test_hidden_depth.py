@@ -14,6 +14,7 @@ from extrags.depth.hidden import SOLID
 from extrags.depth.weights import load_completion
 from extrags.errors import CaptureError, ConfigError, WeightsError
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
+from extrags.restoration.diffusion.weights import COLONS, starting_weights
 from extrags.restoration.hidden_depth import training as training_module
 from extrags.restoration.hidden_depth.examples import HiddenDepthExamples
 from extrags.restoration.hidden_depth.training import (

@@ -12,7 +12,9 @@ import torch
 
 from extrags.errors import CaptureError, ConfigError, WeightsError
 from extrags.metrics.lpips import Lpips
+from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.diffusion.network import build_network
+from extrags.restoration.diffusion.weights import COLONS, starting_weights
 from extrags.restoration.refinement import refiner as refiner_module
 from extrags.restoration.refinement import training as training_module
 from extrags.restoration.refinement.examples import ExampleCrops, RefinementExamples, RefinerBatch
