@@ -6,6 +6,7 @@ below raised; callers add file and remedy.
 
 from __future__ import annotations
 
+import stat
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -109,7 +110,11 @@ def save_safetensors(file: Path, tensors: dict[str, Tensor], metadata: dict[str,
 
     file.parent.mkdir(parents=True, exist_ok=True)
     with whole_file(file) as partial:
+        partial.touch()
+        usual = stat.S_IMODE(partial.stat().st_mode)
         save_file({name: value.contiguous() for name, value in tensors.items()}, str(partial), metadata)
+        # safetensors makes files that their owner alone may read, whatever the umask says.
+        partial.chmod(usual)
 
 
 def load_state_dict(file: Path) -> dict[str, Tensor]:

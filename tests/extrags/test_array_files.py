@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import os
+import stat
 from pathlib import Path
 
 import pytest
@@ -14,6 +16,16 @@ def test_tensors_of_any_layout_come_back(tmp_path: Path) -> None:
     found = load_safetensors(tmp_path / "new" / "x.safetensors")
     assert torch.equal(found["turned"], values.T)
     assert found["half"].dtype == torch.float16
+
+
+@pytest.mark.parametrize("umask", [0o022, 0o007])
+def test_others_may_read_it_as_the_umask_says(tmp_path: Path, umask: int) -> None:
+    before = os.umask(umask)
+    try:
+        save_safetensors(tmp_path / "x.safetensors", {"a": torch.ones(3)})
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "x.safetensors").stat().st_mode) == 0o666 & ~umask
 
 
 def test_a_write_that_fails_leaves_what_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

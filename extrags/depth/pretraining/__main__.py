@@ -11,9 +11,8 @@ from dataclasses import asdict
 from pathlib import Path
 
 import torch
-from safetensors.torch import save_file
 
-from extrags.array_files import load_safetensors
+from extrags.array_files import load_safetensors, save_safetensors
 from extrags.depth.completion import CompletionNetwork
 from extrags.depth.pretraining.cavities import KINDS
 from extrags.depth.pretraining.examples import SIZES, Examples, make_examples
@@ -123,8 +122,8 @@ def main() -> None:
         mix_weights(network, load_safetensors(options.start), options.keep)
     scores = _scores(network, held_out)
     log.info("after: %s", scores)
-    weights = {name: value.cpu().half().contiguous() for name, value in network.state_dict().items()}
-    save_file(weights, options.folder / "completion.safetensors")
+    weights = {name: value.cpu().half() for name, value in network.state_dict().items()}
+    save_safetensors(options.folder / "completion.safetensors", weights)
     record = {
         "settings": {name: value for name, value in asdict(settings).items() if value != math.inf},
         "examples": len(bank),

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from extrags.array_files import load_safetensors
+from extrags.array_files import load_safetensors, save_safetensors
 from extrags.config import EnhanceConfig
 from extrags.depth.completion import CompletionNetwork
 from extrags.depth.hidden import depth_from_image
@@ -300,18 +300,14 @@ class EmbeddedEnhancer:
             path: a folder.
             half: weights in float16: half the size, for shipping.
         """
-        from safetensors.torch import save_file
-
         path.mkdir(parents=True, exist_ok=True)
-        weights = {
-            name: (value.half() if half else value).contiguous()
-            for name, value in self.network.state_dict().items()
-        }
-        save_file(weights, str(path / WEIGHTS))
+        weights = {name: value.half() if half else value for name, value in self.network.state_dict().items()}
+        save_safetensors(path / WEIGHTS, weights)
         # Those of a restorer that was here before are not this one's.
         (path / PATCHES).unlink(missing_ok=True)
         if self.patches is not None:
-            save_file({"patches": (self.patches * COLOR_STEPS).round().to(torch.uint8)}, str(path / PATCHES))
+            levels = (self.patches * COLOR_STEPS).round().to(torch.uint8)
+            save_safetensors(path / PATCHES, {"patches": levels})
         shutil.rmtree(path / UNTRAINED, ignore_errors=True)
         if self.untrained is not None:
             self.untrained.save(path / UNTRAINED, half=half)

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from extrags.array_files import load_safetensors
+from extrags.array_files import load_safetensors, save_safetensors
 from extrags.config import CoarseConfig, EnhanceConfig, PretrainedConfig
 from extrags.errors import ConfigError, WeightsError
 from extrags.model_files import fingerprint
@@ -131,10 +131,8 @@ class PretrainedEnhancer(PreparedEnhancer):
 
     def save(self, path: Path) -> None:
         """Write `restorer.json`, `text.safetensors` and `references/`; the model stays where it is."""
-        from safetensors.torch import save_file
-
         self.save_common(path, backend=self.name, format_number=FORMAT)
-        save_file(self.text, str(path / TEXT))
+        save_safetensors(path / TEXT, self.text)
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from extrags.array_files import load_safetensors
+from extrags.array_files import load_safetensors, save_safetensors
 from extrags.cameras import Cameras
 from extrags.errors import WeightsError
 from extrags.metrics.filters import filter_separable, gaussian_weights
@@ -191,11 +191,8 @@ class Refiner:
 
     def save(self, path: Path) -> None:
         """Write `refiner.safetensors`, in half precision, and its description."""
-        from safetensors.torch import save_file
-
-        path.mkdir(parents=True, exist_ok=True)
-        weights = {name: value.half().contiguous() for name, value in self.network.state_dict().items()}
-        save_file(weights, str(path / WEIGHTS))
+        weights = {name: value.half() for name, value in self.network.state_dict().items()}
+        save_safetensors(path / WEIGHTS, weights)
         write_description(
             path,
             {
