@@ -26,6 +26,8 @@ from extrags.sequence import EndoscopicSequence, saturated_mask
 
 __all__ = ["Finding", "Inspection", "contact_sheet", "facts", "inspect"]
 
+LOGGERS = ("data_catalog", "extrags.frame_names")
+"""Of what looks at a source while it is read."""
 _TILE_WIDTH = 240
 _MAX_TILES = 30
 
@@ -236,11 +238,13 @@ class _HeardWarnings(logging.Handler):
             self.findings.append(warning(topic, record.getMessage(), field=field))
 
     def __enter__(self) -> _HeardWarnings:
-        logging.getLogger("data_catalog").addHandler(self)
+        for name in LOGGERS:
+            logging.getLogger(name).addHandler(self)
         return self
 
     def __exit__(self, *_: object) -> None:
-        logging.getLogger("data_catalog").removeHandler(self)
+        for name in LOGGERS:
+            logging.getLogger(name).removeHandler(self)
 
 
 def _field_of_view_deg(sequence: EndoscopicSequence) -> float:
