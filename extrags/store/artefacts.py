@@ -7,7 +7,6 @@ import errno
 import json
 import logging
 import shutil
-import stat
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -22,6 +21,7 @@ from extrags.store.directory import ABOUT, DirectoryBackend, private_directory, 
 from extrags.store.integrity import Damage, Depth, default_depth, find_damage, list_contents
 from extrags.store.kept import kept_or_read
 from extrags.store.manifest import MANIFEST, Manifest, is_name, software_versions, stage_of
+from extrags.store.permissions import give_usual_permissions
 from extrags.store.refusal import refused_write
 from extrags.store.slot import Slot
 from extrags.store.storable import Storable
@@ -357,7 +357,7 @@ class Store:
                 slot.path.mkdir()
                 with self._blaming(slot._inputs.values()):
                     yield slot
-                _share(slot.path, like=scratch / ABOUT)
+                give_usual_permissions(slot.path, like=scratch / ABOUT)
                 listing = list_contents(slot.path, slot.run_files)
                 slot._manifest = self.backend.commit(
                     slot.path,
@@ -506,25 +506,6 @@ def _as_damage(error: StoreError, key: str, root: str) -> DamagedArtefactError:
         raise error
     problem = f"cannot be read: {cause.strerror}"
     return DamagedArtefactError(problem, file=MANIFEST, stage=stage_of(key), key=key, store=root)
-
-
-def _share(directory: Path, *, like: Path) -> None:
-    """Give the files of an artefact at least the permissions that a new file has here.
-
-    Some writers make files that their owner alone may read, whatever the umask says: other users of the store
-    could not use them.
-
-    Args:
-        directory: the files.
-        like: a file that was written in the usual way.
-    """
-    usual = stat.S_IMODE(like.stat().st_mode)
-    for path in directory.rglob("*"):
-        mode = path.lstat().st_mode
-        if stat.S_ISREG(mode) and usual & ~mode:
-            # Where a file system has no permissions, nobody is refused.
-            with suppress(OSError):
-                path.chmod(stat.S_IMODE(mode) | usual)
 
 
 def _matches(pattern: str, *names: str) -> bool:

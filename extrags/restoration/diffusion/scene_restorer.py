@@ -109,12 +109,15 @@ def best_of_all(
     carries the reason.
 
     Args:
-        restorers: ready for the scene, at least one; the first serves where there is no validation pair.
+        restorers: ready for the scene, at least one; where no pair has a valid pixel the first counts.
         pairs: those for validation were not trained on.
         transfer: how brightness changes with distance.
         calibrate: fit the expected error of the restorer that is kept to these pairs.
         of_weights: calibration of the weights it began with, where its own has been fitted to these pairs,
             by which no error can be larger than expected.
+
+    Returns:
+        The restorer of the highest PSNR, with its scores, or the classical one with the reason.
     """
     chosen = validation_pairs(pairs)
     if not bool((pairs.weight > 0).any()):
