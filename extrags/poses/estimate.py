@@ -14,8 +14,9 @@ from extrags.config import DEFAULT_PROFILE, PROFILES, IngestConfig, PosesConfig
 from extrags.errors import CaptureError, ConfigError, ShapeError
 from extrags.frame_stacks import frames_of, stacked
 from extrags.poses.attempts import attempted, enough_registered
-from extrags.poses.calibration import LensCalibration, with_calibration
+from extrags.poses.calibration import with_calibration
 from extrags.poses.job import PoseJob, PoseJobResult, run_job
+from extrags.poses.lens_calibration import LensCalibration
 from extrags.poses.registration_report import (
     MIN_TRAINING_FRAMES,
     errors_against_given,

@@ -22,9 +22,9 @@ from typing import Any
 import numpy as np
 
 from extrags.lens import LENS_PARAMETERS, Lens
-from extrags.poses.calibration import LensCalibration
 from extrags.poses.intrinsics_covariance import IntrinsicsCovariance, intrinsics_covariance
 from extrags.poses.job import PoseJobResult
+from extrags.poses.lens_calibration import LensCalibration
 
 __all__ = ["LENS_MODELS", "MappedLens", "map_with_unknown_lens"]
 

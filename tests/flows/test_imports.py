@@ -55,6 +55,12 @@ def command(*words: str) -> str:
             "scipy extrags.training extrags.restoration.diffusion.embedded " + RARE,
             id="key of a restorer",
         ),
+        # COLMAP's process, once or twice a run.
+        pytest.param(
+            "import extrags.poses.colmap, extrags.poses.colmap_triangulation",
+            HEAVY.replace(" numpy pydantic", ""),
+            id="COLMAP's process",
+        ),
         # One step of the training is as good as many.
         pytest.param(
             "import torch\n"

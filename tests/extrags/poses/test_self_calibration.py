@@ -313,7 +313,7 @@ class TestWideLens:
     def test_a_lens_that_no_radial_model_is_near_is_undone(
         self, room: EndoscopicSequence, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr("extrags.poses.calibration.LARGEST_FIT_ERROR", -1.0)
+        monkeypatch.setattr("extrags.poses.lens_calibration.LARGEST_FIT_ERROR", -1.0)
         found = LensCalibration(WIDE, determined=True)
         posed = with_calibration(guessed(room), found, IngestConfig(lens="native"))
         assert posed.lens is None
