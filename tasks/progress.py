@@ -149,17 +149,17 @@ class Pace:
     """How fast loops go, by sequence and stage; the owner sees to it that one thread asks at a time."""
 
     def __init__(self) -> None:
-        self._first: dict[tuple[str, str], tuple[float, int]] = {}
+        self._first: dict[tuple[str, str], tuple[float, int, int]] = {}
 
     def rate(self, progress: StageProgress, now: float) -> float | None:
         """Steps per second since the first one that was seen; None before there are any.
 
-        A count that falls is another loop of the same stage, and begins anew.
+        A count that falls, or of another total, is another loop of the same stage, and begins anew.
         """
         place = (progress.label, progress.stage)
-        begun, first = self._first.setdefault(place, (now, progress.done))
-        if progress.done < first:
-            self._first[place] = (now, progress.done)
+        begun, first, total = self._first.setdefault(place, (now, progress.done, progress.total))
+        if progress.done < first or progress.total != total:
+            self._first[place] = (now, progress.done, progress.total)
             return None
         if progress.done == first or now <= begun:
             return None

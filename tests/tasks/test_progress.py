@@ -164,6 +164,13 @@ class TestPace:
         assert pace.rate(step("finetune-judge", 0, 100), 20.0) is None
         assert pace.rate(step("finetune-judge", 5, 100), 25.0) == pytest.approx(1.0)
 
+    def test_another_total_is_another_loop(self) -> None:
+        """A training that goes on begins with its scenes, and then at the step of its checkpoint."""
+        pace = Pace()
+        pace.rate(step("pretrain", 0, 75), 0.0)
+        assert pace.rate(step("pretrain", 5584, 14000), 10.0) is None
+        assert pace.rate(step("pretrain", 5594, 14000), 15.0) == pytest.approx(2.0)
+
     def test_a_stage_that_ended_teaches_nothing(self) -> None:
         pace = Pace()
         pace.rate(step("coarse", 1, 100), 0.0)
