@@ -24,6 +24,7 @@ from extrags.radial_lens import WIDE_FIELD_DEG
 from extrags.scene import Scene
 from extrags.store.storable import Storable
 from extrags.threads import one_torch_thread
+from extrags.unique_rows import unique_rows
 from extrags.zarr_io import new_group, open_group, read_array, write_array
 
 __all__ = ["Mesh", "fuse_depth", "fuse_surface", "rendered_depth"]
@@ -236,9 +237,9 @@ def _canonical(
     vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"]
 ) -> tuple[Float[np.ndarray, "unique 3"], Int[np.ndarray, "distinct 3"]]:
     """Sort vertices and triangles: their order from Open3D varies between runs, the positions do not."""
-    # Adding zero turns -0.0 into 0.0, so that both sort as equal.
-    unique, index = np.unique(vertices + np.float32(0), axis=0, return_inverse=True)
-    triangles = index.reshape(-1)[triangles]
+    # Adding zero turns -0.0 into 0.0, so that it is the same in all of them.
+    unique, index = unique_rows(vertices + np.float32(0))
+    triangles = index[triangles]
     distinct = (
         (triangles[:, 0] != triangles[:, 1])
         & (triangles[:, 1] != triangles[:, 2])

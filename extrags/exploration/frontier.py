@@ -18,6 +18,7 @@ from extrags.exploration.coverage import direction_bin
 from extrags.freespace import FREE, FreeSpace
 from extrags.raster.native import compiled_kernels
 from extrags.scene import Scene
+from extrags.unique_rows import unique_rows
 
 __all__ = ["Frontier", "find_frontier"]
 
@@ -116,7 +117,7 @@ def find_frontier(scene: Scene, space: FreeSpace, weight: float) -> Frontier:
     row[touching] = np.arange(np.count_nonzero(touching), dtype=np.int32)
     centers = space.from_grid(np.argwhere(touching) - 0.5)
     voxels = np.floor(space.to_grid(scene.gaussians.means.detach().numpy().astype(np.float64)))
-    held = len(np.unique(voxels, axis=0))
+    held = len(unique_rows(voxels)[0])
     return Frontier(
         space=space,
         row=row,

@@ -17,6 +17,7 @@ from extrags.cameras import Cameras, rotation_about
 from extrags.report.charts import INK, QUIET, drawing_style
 from extrags.report.encode import DataImage, png_image
 from extrags.report.inputs import GridLike, MeshLike
+from extrags.unique_rows import unique_rows
 
 __all__ = ["SceneFigure", "clustered", "occupancy_slices", "scene_views", "trajectory_colors"]
 
@@ -162,14 +163,15 @@ def clustered(vertices: np.ndarray, triangles: np.ndarray) -> Float[np.ndarray, 
     cell = diameter / 400
     corners = vertices[triangles]
     while len(corners) > MAX_FACES:
-        _, label = np.unique(np.floor(vertices / cell).astype(np.int64), axis=0, return_inverse=True)
-        label = label.reshape(-1)
+        _, label = unique_rows(np.floor(vertices / cell).astype(np.int64))
         sums = np.stack([np.bincount(label, vertices[:, axis]) for axis in range(3)], axis=1)
         merged = sums / np.bincount(label)[:, None]
         faces = label[triangles]
         whole = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-        _, first = np.unique(np.sort(faces[whole], axis=1), axis=0, return_index=True)
-        corners = merged[faces[whole][np.sort(first)]]
+        faces = faces[whole]
+        _, which = unique_rows(np.sort(faces, axis=1))
+        _, first = np.unique(which, return_index=True)
+        corners = merged[faces[np.sort(first)]]
         cell *= 1.25
     return np.asarray(corners)
 

@@ -16,6 +16,7 @@ from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
 from extrags.thresholds import HOLE_ALPHA
 from extrags.training.starting import LEAST_COLOR, surface_normals, thin_out
+from extrags.unique_rows import unique_rows
 
 __all__ = ["hole_gaussians"]
 
@@ -145,8 +146,8 @@ def _one_per_cell(
     points: Float[np.ndarray, "n 3"], rgb: Float[np.ndarray, "n 3"], edge: float
 ) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]]:
     cells = np.floor((points - points.min(axis=0)) / edge).astype(np.int64)
-    _, owner, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-    owner = owner.reshape(-1)
+    _, owner = unique_rows(cells)
+    count = np.bincount(owner)
 
     def averaged(array: np.ndarray) -> np.ndarray:
         sums = np.stack(
