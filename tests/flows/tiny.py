@@ -21,6 +21,7 @@ from extrags.config import PipelineConfig, profile_config
 from extrags.sequence import EndoscopicSequence
 from flows.runners import DirectRunner
 from flows.wiring import run_sequence
+from tests.drawn_once import drawn_once
 
 SEQUENCE = "phantom/0@sparse"
 
@@ -104,7 +105,8 @@ def tiny_config(**overrides: Any) -> PipelineConfig:
 def spared() -> Iterator[None]:
     """Most of what a tiny run would cost, and what other packages prove, is not paid for by every run.
 
-    A process renders each phantom once, and surfaces are compared at a tenth of the usual samples.
+    A process renders each phantom once, and draws equal pictures of reports once; surfaces are compared at a
+    tenth of the usual samples.
     """
     rendered = functools.cache(data_catalog.phantom.recording.record)
 
@@ -115,6 +117,7 @@ def spared() -> Iterator[None]:
     with (
         patch.object(data_catalog.phantom.recording, "record", record),
         patch.object(extrags.metrics.surface, "N_SAMPLES", 3000),
+        drawn_once(),
     ):
         yield
 

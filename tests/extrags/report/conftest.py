@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +14,7 @@ from extrags.config import PipelineConfig
 from extrags.metrics.protocol import PROTOCOL_VERSION
 from extrags.report import ReportInputs
 from extrags.sequence import EndoscopicSequence, Split
+from tests.drawn_once import drawn_once
 
 WIDTH, HEIGHT, RADIUS_MM = 48, 40, 10.0
 TRAIN, TEST = np.arange(6), np.arange(6, 11)
@@ -51,6 +53,13 @@ class Grid:
 class TubeMesh:
     vertices: np.ndarray
     triangles: np.ndarray
+
+
+@pytest.fixture(scope="package", autouse=True)
+def little_drawing() -> Iterator[None]:
+    """Most tests are about words and numbers of a page, and their inputs differ in little."""
+    with drawn_once():
+        yield
 
 
 @pytest.fixture(scope="session")

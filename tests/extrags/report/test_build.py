@@ -14,6 +14,7 @@ from extrags.metrics.registry import Metric, register_metric, unregister_metric
 from extrags.report import ReportInputs, build_report
 from extrags.report.numbers import regions
 from extrags.sequence import Split
+from tests.drawn_once import drawn_anew
 
 from .conftest import Renders, result_of
 from .pages import Page, decoded
@@ -44,7 +45,10 @@ def test_page_loads_nothing_from_outside(page: Page, html: str) -> None:
             assert 'href="http' not in svg
 
 
-def test_same_inputs_give_the_same_bytes(inputs: ReportInputs, html: str) -> None:
+def test_same_inputs_give_the_same_bytes(
+    inputs: ReportInputs, html: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn_anew(monkeypatch)
     assert build_report(inputs, CONFIG) == html
 
 
