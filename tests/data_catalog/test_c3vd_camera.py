@@ -130,7 +130,7 @@ class TestPinhole:
             np.testing.assert_allclose(found, expected, atol=1e-8)
 
     @pytest.mark.parametrize("name", ["c3vd", "c3vdv2"])
-    @pytest.mark.parametrize("width", [160, 225, 400, 675])
+    @pytest.mark.parametrize("width", [160, 225, 400, pytest.param(675, marks=pytest.mark.slow)])
     def test_pictures_stay_in_register(self, name, width) -> None:
         """A picture of directions, seen by the fisheye and resampled, against the same seen by the pinhole.
 

@@ -26,11 +26,14 @@ class TestRightSources:
         assert diagnose(sparse, "phantom") == []
         assert diagnose(distanced, "phantom") == []
 
-    @pytest.mark.parametrize("name", ["sinus_hopkins", "simcol3d_s1", "c3vdv2_sim/c9_transverse1_t3_v1"])
-    def test_shared_data(self, shared_data, name) -> None:
+    @pytest.mark.parametrize(
+        ("name", "downscale"),
+        [("sinus_hopkins", 2), ("simcol3d_s1", 1), ("c3vdv2_sim/c9_transverse1_t3_v1", 2)],
+    )
+    def test_shared_data(self, shared_data, name, downscale) -> None:
         if not (shared_data / name).is_dir():
             pytest.skip(f"no {name} here")
-        inspection = inspect(shared_data / name)
+        inspection = inspect(shared_data / name, IngestConfig(downscale=downscale))
         assert inspection.ok, inspection.findings
         assert inspection.conventions
         assert inspection.facts is not None

@@ -60,7 +60,14 @@ class TestStart:
         os.close(writing)
         assert (said.returncode, said.stderr) == (0, "")
 
-    @pytest.mark.parametrize("closed", [">&-", "2>&-", ">&- 2>&-"])
+    @pytest.mark.parametrize(
+        "closed",
+        [
+            pytest.param(">&-", marks=pytest.mark.slow),
+            pytest.param("2>&-", marks=pytest.mark.slow),
+            ">&- 2>&-",
+        ],
+    )
     def test_closed_streams_change_no_exit_code(self, closed: str, tmp_path: Path) -> None:
         for verb, code in (("status", 0), ("cache ls", 0), ("cache nonsense", 2)):
             said = shell(f'{verb} --store "{tmp_path}" {closed}')
@@ -91,7 +98,7 @@ class TestStart:
             == "extrags: no home folder is known of this user; set HOME to a folder that can be written\n"
         )
 
-    @pytest.mark.parametrize("encoding", ["latin-1", "ascii"])
+    @pytest.mark.parametrize("encoding", [pytest.param("latin-1", marks=pytest.mark.slow), "ascii"])
     def test_any_encoding_will_do(self, encoding: str, tmp_path: Path) -> None:
         said = shell(f'status --store "{tmp_path}"', {"PYTHONIOENCODING": encoding})
         assert said.returncode == 0

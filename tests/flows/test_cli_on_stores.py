@@ -157,7 +157,13 @@ class TestFinished:
         assert {row["stage"]: row["state"] for row in again} == {row["stage"]: row["state"] for row in rows}
         assert all(row["seconds"] == row["made_seconds"] for row in again if row["state"] == "ran")
 
-    @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(errno.ENOSPC, "No space left on device")])
+    @pytest.mark.parametrize(
+        "error",
+        [
+            KeyboardInterrupt(),
+            pytest.param(OSError(errno.ENOSPC, "No space left on device"), marks=pytest.mark.slow),
+        ],
+    )
     def test_a_page_stays_where_making_it_again_does_not_end(
         self,
         error: BaseException,

@@ -117,7 +117,7 @@ def test_photographs_are_whole_and_the_same_each_time(kind: Kind) -> None:
 def test_training_lowers_the_error_on_what_it_is_shown() -> None:
     generator = torch.Generator().manual_seed(3)
     settings = StereoSettings(hypotheses=24, radius_px=2, refinement_hypotheses=5)
-    examples = make_examples("sac", 2, generator, (32, 48), settings)
+    examples = make_examples("sac", 2, generator, (24, 32), settings)
     assert examples is not None
     bank = ExampleBank(generator)
     bank.add(examples)
@@ -186,7 +186,7 @@ def test_the_second_sweep_is_practised_too() -> None:
 def test_points_lie_on_the_surface_but_for_their_error() -> None:
     generator = torch.Generator().manual_seed(8)
     scene = Cavities("field", 4, generator)
-    clips = photograph(scene, generator, (48, 64), 5)
+    clips = photograph(scene, generator, (36, 48), 5)
     points = triangulated_points(clips, scene)
     there = (points > 0) & clips.frames.mask
     assert there.sum() > 100

@@ -87,10 +87,11 @@ def test_stereo_alone_is_farther_off(withheld: EndoscopicSequence, estimate: Dep
 
 def test_a_gpu_gives_that_of_a_processor(device: str, specification: Callable[[], None]) -> None:
     """On the processor, torch's implementation stands in for what runs on a GPU."""
-    small = with_points(withheld_phantom(8, width=64, height=48))
+    small = with_points(withheld_phantom(6, width=64, height=48))
     part = small.training_part()
     settings = [
-        DepthConfig(device="cpu", completion=completion, **SETTINGS) for completion in ("none", "bundled")
+        DepthConfig(device="cpu", completion=completion, hypotheses=24, sources=3)
+        for completion in ("none", "bundled")
     ]
     expected = [estimate_depth(part, each) for each in settings]
     specification()
@@ -99,8 +100,8 @@ def test_a_gpu_gives_that_of_a_processor(device: str, specification: Callable[[]
     assert {each.report["device"] for each in expected} == {"cpu"}
     assert {each.report["device"] for each in found} == {device}
     # Rounding moves most depths of stereo by less than a thousandth. Where two depths match nearly equally
-    # well it decides between them: between two implementations on a processor 1.7 % of these pixels move by
-    # more than a percent.
+    # well it decides between them: between two implementations on a processor one to three in a hundred of
+    # these pixels move by more than a percent.
     away = np.abs(np.log(found[0].depth[part.mask] / expected[0].depth[part.mask]))
     assert np.median(away) < 1e-3
     assert (away > 0.01).mean() < 0.04

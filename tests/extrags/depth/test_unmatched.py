@@ -20,6 +20,7 @@ from tests.extrags.depth.withheld import true_training_depth, with_points, withh
 
 SETTINGS = DepthConfig(hypotheses=48, sources=4)
 BAD = 4
+SLOW = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +33,10 @@ def ordinary(withheld: EndoscopicSequence) -> DepthEstimate:
     return estimate_depth(withheld.training_part(), SETTINGS)
 
 
-@pytest.mark.parametrize("kind", ["black", "red", "noise", "mirrored"])
+@pytest.mark.parametrize(
+    "kind",
+    ["black", pytest.param("red", marks=SLOW), pytest.param("noise", marks=SLOW), "mirrored"],
+)
 def test_a_picture_of_something_else_is_told_to_be_a_guess(
     kind: str, withheld: EndoscopicSequence, ordinary: DepthEstimate
 ) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 
@@ -14,11 +15,17 @@ from extrags.sequence import EndoscopicSequence, Split
 
 def withheld_phantom(frames: int = 10, *, width: int = 96, height: int = 72) -> EndoscopicSequence:
     """The last frames of a recording train and have no depth, those before are held out and keep theirs."""
-    whole = read("phantom/0@sparse", IngestConfig(width=width, height=height, max_frames=40))
+    whole = recorded(width, height)
     assert whole.recording is not None
     stretch = np.flatnonzero(whole.recording == whole.recording[-1])[:frames]
     others = np.setdiff1d(np.arange(len(whole)), stretch)
     return replace(whole, split=Split("stretch", stretch, others)).without_training_depth()
+
+
+@cache
+def recorded(width: int, height: int) -> EndoscopicSequence:
+    """Rendered once a process; nobody writes into it."""
+    return read("phantom/0@sparse", IngestConfig(width=width, height=height, max_frames=40))
 
 
 def true_training_depth(sequence: EndoscopicSequence) -> np.ndarray:

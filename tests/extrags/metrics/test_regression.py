@@ -99,10 +99,10 @@ def test_few_false_alarms_among_many_quantities(seeds: int) -> None:
 
     alarms = sum(
         bool(compare_results(drawn(2 * number), drawn(2 * number + 1))["regressions"])
-        for number in range(200)
+        for number in range(100)
     )
-    # 3, 3 and 6; corrected over what has changed by enough alone 14, 13 and 21.
-    assert alarms <= 10
+    # Of 200 there were 3, 3 and 6; corrected over what has changed by enough alone 14, 13 and 21.
+    assert alarms <= 6
 
 
 def test_runs_that_fail_now_are_a_regression() -> None:
