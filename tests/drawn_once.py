@@ -1,4 +1,4 @@
-"""Charts and views of a report are drawn once for equal content: most of what a page takes is matplotlib's."""
+"""Charts and views of a report, drawn once for equal content: they are most of what a page takes."""
 
 from __future__ import annotations
 
