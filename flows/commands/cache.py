@@ -91,7 +91,7 @@ def ls(given: argparse.Namespace) -> int:
     from flows.terminal import console
 
     store = _looked_into(given)
-    manifests = store.ls(given.pattern)
+    manifests = [item for pattern in _spellings(given.pattern) for item in store.ls(pattern)]
     damaged = [item.key for item in manifests if given.verify and store.examine(item.key)]
     if given.json != "-":
         table = Table(box=None, pad_edge=False, header_style="bold")
@@ -177,6 +177,13 @@ def _examined(store: Store) -> tuple[int, list[DamagedArtefactError]]:
     return len(keys), [damage for damage in found if damage is not None]
 
 
+def _spellings(pattern: str) -> list[str]:
+    """A pattern, and where it names a sequence of the catalogue in another spelling, what artefacts have."""
+    from data_catalog.names import plain_name
+
+    return list(dict.fromkeys((pattern, plain_name(pattern))))
+
+
 def rm(given: argparse.Namespace) -> int:
     """`extrags cache rm`.
 
@@ -184,7 +191,9 @@ def rm(given: argparse.Namespace) -> int:
         StoreError: when there is no such store, or nothing in it matches.
     """
     store = _looked_into(given)
-    removed = [key for pattern in given.patterns for key in store.rm(pattern)]
+    removed = [
+        key for given_as in given.patterns for pattern in _spellings(given_as) for key in store.rm(pattern)
+    ]
     if not removed:
         raise StoreError(
             f"nothing in {store.root} matches {' or '.join(given.patterns)} (keys, stages and sequences as "

@@ -361,6 +361,15 @@ class TestCache:
         assert main(["cache", "rm", "toy-v1-1", "--store", store]) == 0
         assert "1 artefact removed" in capsys.readouterr().out
 
+    def test_sequences_are_found_by_any_spelling(
+        self, store: str, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        with Store(store).slot(stage="toy", version=1, key="toy-v1-7", label="phantom/7@sparse"):
+            pass
+        assert main(["cache", "ls", "phantom/7", "--store", store, "--json", "-"]) == 0
+        assert [item["key"] for item in json.loads(capsys.readouterr().out)] == ["toy-v1-7"]
+        assert main(["cache", "rm", "phantom/7", "--store", store]) == 0
+
     def test_labels_are_told_with_their_brackets(
         self, store: str, capsys: pytest.CaptureFixture[str]
     ) -> None:
