@@ -424,6 +424,29 @@ class Store:
         ]
         return sorted(chosen, key=lambda manifest: (manifest.started, manifest.key))
 
+    def manifests(self) -> tuple[list[Manifest], list[str]]:
+        """Manifests of all artefacts, and keys of those whose manifest cannot be read, with a warning each.
+
+        For who looks over a whole store, which one artefact that is damaged, or not for this user, must not
+        keep from the others.
+
+        Raises:
+            StoreError: when the store cannot be read. An object store that does not answer tells nothing of
+                a single artefact.
+        """
+        found, unreadable = [], []
+        for key in self.backend.names():
+            try:
+                manifest = self.backend.read_manifest(key)
+            except StoreError as error:
+                if "://" in self.root and not isinstance(error, DamagedArtefactError):
+                    raise
+                log.warning("%s is passed over: %s", key, error)
+                unreadable.append(key)
+            else:
+                found += [] if manifest is None else [manifest]
+        return sorted(found, key=lambda manifest: (manifest.started, manifest.key)), unreadable
+
     def _readable_manifest(self, key: str) -> Manifest | None:
         try:
             return self.backend.read_manifest(key)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import re
 import sys
 from typing import TYPE_CHECKING
@@ -250,11 +251,12 @@ def gc(given: argparse.Namespace) -> int:
 
     Raises:
         ConfigError: for an age or a size that is none.
-        StoreError: when there is no such store.
+        StoreError: when there is no such store, or something could not be removed; all else has been by
+            then.
     """
     from dataclasses import asdict
 
-    from extrags.store.retention import Policy, apply_policy, planned_removals
+    from extrags.store.retention import Policy
 
     older_than_s = None if given.older_than is None else age_s(given.older_than)
     max_bytes = None if given.max_size is None else size_bytes(given.max_size)
@@ -262,12 +264,9 @@ def gc(given: argparse.Namespace) -> int:
         raise ConfigError(f"--keep-last {given.keep_last}: expected 1 or more")
     store = _looked_into(given)
     # Here, because they load Prefect, which wrong usage must not wait for.
-    from tasks.locks import sweep_locks
+    from flows.cleaning import clean_store
     from tasks.stage import all_stage_versions
 
-    leftovers = store.gc(dry_run=given.dry_run)
-    if not given.dry_run:
-        leftovers += sweep_locks(store.locks)
     policy = Policy(
         older_than_s=older_than_s,
         max_bytes=max_bytes,
@@ -276,7 +275,8 @@ def gc(given: argparse.Namespace) -> int:
         versions=all_stage_versions(),
         with_inputs=given.with_inputs,
     )
-    removed = planned_removals(store, policy)[0] if given.dry_run else apply_policy(store, policy)
+    cleaned = clean_store(store, policy, dry_run=given.dry_run)
+    leftovers, removed, skipped = cleaned.leftovers, cleaned.artefacts.removed, cleaned.artefacts.skipped
     if given.json != "-":
         for name in leftovers:
             print(name)
@@ -286,8 +286,12 @@ def gc(given: argparse.Namespace) -> int:
         print(f"{counted(len(leftovers), 'leftover')} {would}removed from {store.root}")
         freed = size_text(sum(item.bytes for item in removed))
         print(f"{counted(len(removed), 'artefact')} of {freed} {would}removed")
+        if skipped:
+            print(f"{counted(len(skipped), 'artefact')} skipped, whose manifests cannot be read")
     rows = [asdict(item) for item in removed]
-    write_json({"dry_run": given.dry_run, "leftovers": leftovers, "artefacts": rows}, given.json)
+    found = {"dry_run": given.dry_run, "leftovers": leftovers, "artefacts": rows, "skipped": skipped}
+    write_json(found, given.json)
+    cleaned.check()
     return 0
 
 
@@ -312,7 +316,10 @@ def size_bytes(text: str) -> int:
     found = re.fullmatch(r"(\d+(?:\.\d+)?) ?([KMGT]iB|)", text)
     if found is None:
         raise ConfigError(f"{text!r} is no size; expected a number with KiB, MiB, GiB or TiB, such as 50GiB")
-    return int(float(found[1]) * BYTES[found[2]])
+    size = float(found[1]) * BYTES[found[2]]
+    if math.isinf(size):
+        raise ConfigError(f"{text[:20]}... is larger than any store")
+    return int(size)
 
 
 def _looked_into(given: argparse.Namespace) -> Store:
