@@ -249,13 +249,16 @@ class Store:
         """Read all files of an artefact, on an object store the remote ones; what is wrong, or None.
 
         Raises:
-            StoreError: when the store cannot be read.
+            StoreError: when the store cannot be read, or a file for a reason that is no damage, such as
+                permissions.
         """
         try:
             manifest = self.backend.read_manifest(_checked(key))
+            damage = None if manifest is None else self.backend.examine(manifest)
         except StoreError as error:
             return _as_damage(error, key, self.root)
-        damage = None if manifest is None else self.backend.examine(manifest)
+        except OSError as error:
+            raise StoreError(f"{error.filename or key} cannot be read: {error.strerror or error}") from error
         return None if damage is None else self._damaged(key, damage)
 
     def verify(self, ref: Ref) -> bool:

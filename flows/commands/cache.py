@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import math
 import re
 import sys
+from collections.abc import Collection
 from typing import TYPE_CHECKING
 
 from extrags.errors import ConfigError, DamagedArtefactError, StoreError
@@ -17,6 +19,8 @@ if TYPE_CHECKING:
     from extrags.store import Store
 
 __all__ = ["add_arguments", "age_s", "gc", "ls", "rm", "size_bytes", "usage", "verify"]
+
+log = logging.getLogger(__name__)
 
 SECONDS = {"h": 3600.0, "d": 86400.0, "w": 7 * 86400.0}
 BYTES = {"": 1, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30, "TiB": 2**40}
@@ -81,7 +85,7 @@ def add_arguments(parser: Parser) -> None:
 
 
 def ls(given: argparse.Namespace) -> int:
-    """`extrags cache ls`; with `--verify`, exit code 1 when an artefact is damaged.
+    """`extrags cache ls`; with `--verify`, exit code 1 when an artefact is damaged or unreadable.
 
     Raises:
         StoreError: when there is no such store.
@@ -93,7 +97,8 @@ def ls(given: argparse.Namespace) -> int:
 
     store = _looked_into(given)
     manifests = [item for pattern in _spellings(given.pattern) for item in store.ls(pattern)]
-    damaged = [item.key for item in manifests if given.verify and store.examine(item.key)]
+    found, unreadable = _examined(store, [item.key for item in manifests] if given.verify else [])
+    damaged = [damage.key for damage in found]
     if given.json != "-":
         table = Table(box=None, pad_edge=False, header_style="bold")
         table.add_column("stage", no_wrap=True)
@@ -104,6 +109,7 @@ def ls(given: argparse.Namespace) -> int:
         table.add_column("key", overflow="fold")
         for item in manifests:
             mark = " [red]DAMAGED[/]" if item.key in damaged else ""
+            mark = " [red]UNREADABLE[/]" if item.key in unreadable else mark
             cost = (f"{item.seconds:.1f}", size_text(item.bytes))
             names = (escape(item.stage), escape(item.label), escape(item.started[:16]))
             table.add_row(*names, *cost, escape(item.key) + mark)
@@ -116,11 +122,11 @@ def ls(given: argparse.Namespace) -> int:
         for item in manifests
     ]
     write_json(rows, given.json)
-    return 1 if damaged else 0
+    return 1 if damaged or unreadable else 0
 
 
 def verify(given: argparse.Namespace) -> int:
-    """`extrags cache verify`; exit code 1 when an artefact is damaged, also if it is set aside.
+    """`extrags cache verify`; exit code 1 when an artefact is damaged, set aside or not, or unreadable.
 
     Raises:
         StoreError: when there is no such store.
@@ -128,14 +134,16 @@ def verify(given: argparse.Namespace) -> int:
     from rich.markup import escape
     from rich.table import Table
 
+    from extrags.store.manifest import stage_of
     from flows.terminal import console
 
     store = _looked_into(given)
-    checked, damaged = _examined(store)
-    aside = [store.set_aside(damage) if given.repair else None for damage in damaged]
+    keys = store.keys()
+    damaged, unreadable = _examined(store, keys)
+    aside = [_set_aside(store, damage) if given.repair else None for damage in damaged]
     if given.json != "-":
         out = console()
-        if damaged:
+        if damaged or unreadable:
             table = Table(box=None, pad_edge=False, header_style="bold")
             table.add_column("stage", no_wrap=True)
             for column in ("damage", "key", *(["set aside as"] if given.repair else [])):
@@ -144,8 +152,13 @@ def verify(given: argparse.Namespace) -> int:
                 what = f"{damage.file}: {damage.problem}" if damage.file else damage.problem
                 cells = (damage.stage, what, damage.key, *([place or ""] if given.repair else []))
                 table.add_row(*map(escape, cells))
+            for key, problem in unreadable.items():
+                table.add_row(*map(escape, (stage_of(key), problem, key)))
             out.print(table)
-        out.print(f"{len(damaged)} of {checked} artefacts damaged in {store.root}", markup=False)
+        out.print(f"{len(damaged)} of {len(keys)} artefacts damaged in {store.root}", markup=False)
+        if unreadable:
+            # They may be whole: whoever may read them can tell.
+            out.print(f"{counted(len(unreadable), 'artefact')} could not be read", markup=False)
         if damaged and not given.repair:
             out.print("with --repair they are set aside, and the next run makes them anew")
         elif damaged:
@@ -160,22 +173,48 @@ def verify(given: argparse.Namespace) -> int:
         }
         for damage, place in zip(damaged, aside, strict=True)
     ]
-    write_json({"store": store.root, "artefacts": checked, "damaged": rows}, given.json)
-    return 1 if damaged else 0
+    others = [{"stage": stage_of(key), "key": key, "problem": told} for key, told in unreadable.items()]
+    found = {"store": store.root, "artefacts": len(keys), "damaged": rows, "unreadable": others}
+    write_json(found, given.json)
+    return 1 if damaged or unreadable else 0
 
 
-def _examined(store: Store) -> tuple[int, list[DamagedArtefactError]]:
-    """Number of artefacts, and what is wrong with some of them; with a progress bar in a terminal."""
+def _set_aside(store: Store, damage: DamagedArtefactError) -> str | None:
+    """Where a damaged artefact is now; None where it stays, with a warning if it cannot be moved."""
+    try:
+        return store.set_aside(damage)
+    except StoreError as error:
+        log.warning("%s", error)
+        return None
+
+
+def _examined(store: Store, keys: Collection[str]) -> tuple[list[DamagedArtefactError], dict[str, str]]:
+    """What is wrong with some artefacts, and why others cannot be read, by key.
+
+    With a progress bar in a terminal.
+
+    Raises:
+        StoreError: when an object store does not answer, which tells nothing of a single artefact.
+    """
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     from flows.terminal import console
 
-    keys = store.keys()
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     bars = Progress(*columns, console=console(error=True), transient=True, disable=not sys.stderr.isatty())
+    damaged: list[DamagedArtefactError] = []
+    unreadable: dict[str, str] = {}
     with bars:
-        found = [store.examine(key) for key in bars.track(keys, description="reading")]
-    return len(keys), [damage for damage in found if damage is not None]
+        for key in bars.track(keys, description="reading"):
+            try:
+                damage = store.examine(key)
+            except StoreError as error:
+                if "://" in store.root:
+                    raise
+                unreadable[key] = str(error)
+            else:
+                damaged += [] if damage is None else [damage]
+    return damaged, unreadable
 
 
 def _spellings(pattern: str) -> list[str]:
