@@ -23,7 +23,13 @@ from flows.expectation import Expectation, expectations, expected_words, longest
 from flows.leases import run_lease
 from flows.limits import DEFAULT_LIMITS, StageLimits
 from flows.methods import MethodName, profile_label
-from flows.outcome import DatasetFailedError, DatasetOutcome, SequenceFailedError, SequenceOutcome, StageRow
+from flows.outcome import (
+    DatasetFailedError,
+    DatasetOutcome,
+    SequenceFailedError,
+    SequenceOutcome,
+    failed_outcome,
+)
 from flows.pages import dataset_page
 from flows.parameters import Matrix, Sequences, Settings, StoreRoot
 from flows.preflight import preflight_cases
@@ -235,9 +241,4 @@ def outcome_of(sequence: str, state: State[Any]) -> SequenceOutcome:
     # Not a stage but the run itself failed (a crash of its task runner, say).
     reason = str(found) if found is not None else state.name or "unknown"
     log.error("%s: %s", sequence, reason)
-    return SequenceOutcome(
-        sequence,
-        "failed",
-        [StageRow("ingest", "failed", reason=reason)],
-        error=found if isinstance(found, Exception) else None,
-    )
+    return failed_outcome(sequence, reason, found if isinstance(found, Exception) else None)
