@@ -9,6 +9,7 @@ from typing import TypeVar
 from extrags.errors import StoreError
 from extrags.store import Store
 from extrags.store.retention import Cleaning, Policy, apply_policy, planned_removals
+from extrags.store.runs import sweep_unreadable
 from tasks.locks import sweep_locks
 
 __all__ = ["Cleaned", "clean_store"]
@@ -66,6 +67,7 @@ def clean_store(store: Store, policy: Policy, *, dry_run: bool = False) -> Clean
     done.leftovers += done.attempt(lambda: store.gc(dry_run=dry_run)) or []
     if not dry_run:
         done.leftovers += done.attempt(lambda: sweep_locks(store.locks)) or []
+    done.leftovers += done.attempt(lambda: sweep_unreadable(store, dry_run=dry_run)) or []
     clean = planned_removals if dry_run else apply_policy
     cleaning = done.attempt(lambda: clean(store, policy))
     if cleaning is not None:

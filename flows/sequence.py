@@ -14,7 +14,7 @@ from extrags.config import DEFAULT_PROFILE, ProfileName, Seed
 from extrags.errors import ExtragsError
 from extrags.stages import StageName
 from extrags.store import Store
-from extrags.store.runs import file_killed
+from extrags.store.runs import file_killed, sweep_unreadable
 from flows.cases import SequenceCase, record_outcome_quietly
 from flows.leases import is_inner_run, run_lease
 from flows.limits import DEFAULT_LIMITS, StageLimits
@@ -123,6 +123,6 @@ def open_store(root: str) -> Store:
     store.check_writable()
     if is_inner_run():
         return store
-    for name in [*store.sweep(), *sweep_locks(store.locks), *file_killed(store)]:
+    for name in [*store.sweep(), *sweep_locks(store.locks), *file_killed(store), *sweep_unreadable(store)]:
         log.info("removed what a killed run left: %s", name)
     return store

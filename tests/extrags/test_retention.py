@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import errno
+import fcntl
 import json
 import os
 import subprocess
@@ -20,7 +21,7 @@ from extrags.store import Ref, Store
 from extrags.store.directory import DirectoryBackend
 from extrags.store.records import remove_record
 from extrags.store.retention import Policy, Removal, apply_policy, planned_removals, usage
-from extrags.store.runs import active_runs, file_killed, recorded_run, runs_of
+from extrags.store.runs import active_runs, file_killed, recorded_run, runs_of, sweep_unreadable
 
 DAY_S = 86400.0
 
@@ -429,6 +430,59 @@ def test_a_record_that_is_half_written_is_read_again(store: Store, monkeypatch: 
         monkeypatch.setattr("time.sleep", lambda _: path.write_bytes(whole))
         (run,) = active_runs(store)
         assert run.keys == {"ingest-v1-00"}
+
+
+@pytest.mark.parametrize(
+    ("content", "days", "held", "kept"),
+    [
+        ('{"sequence": ', 31, False, False),
+        ("", 31, False, False),
+        ("", 29, False, True),
+        ("", 31, True, True),
+        ('{"sequence": "a", "ended": "2026-01-01", "keys": []}', 31, False, True),
+    ],
+)
+def test_records_of_runs_that_nobody_can_read_go_when_they_are_old(
+    content: str,
+    days: float,
+    held: bool,
+    kept: bool,
+    store: Store,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    monkeypatch.setattr("time.sleep", lambda _: None)
+    caplog.set_level("INFO")
+    path = store.state / "runs" / "active" / "0123.json"
+    path.parent.mkdir(parents=True)
+    path.write_text(content)
+    os.utime(path, (time.time() - days * DAY_S,) * 2)
+    with path.open() as file:
+        if held:
+            fcntl.flock(file, fcntl.LOCK_EX)
+        found = sweep_unreadable(store, dry_run=True)
+        assert path.exists()
+        assert sweep_unreadable(store) == found == ([] if kept else ["runs/active/0123.json"])
+    assert path.exists() is kept
+    assert ("cannot be read and is old: it is removed" in caplog.text) is not kept
+
+
+def test_a_record_that_may_not_be_read_stops_nobody(
+    store: Store, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = store.state / "runs" / "active" / "0123.json"
+    path.parent.mkdir(parents=True)
+    path.write_text("{}")
+    usual = os.open
+
+    def opened(place: Path, *given: int, **more: int) -> int:
+        if place == path:
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return usual(place, *given, **more)
+
+    monkeypatch.setattr(os, "open", opened)
+    assert (active_runs(store), runs_of(store), file_killed(store)) == ([], [], [])
+    assert "what it uses, cannot be read: Permission denied" in caplog.text
 
 
 def test_a_record_is_plain_json(store: Store) -> None:
