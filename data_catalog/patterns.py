@@ -8,6 +8,7 @@ from fnmatch import fnmatchcase
 from typing import NamedTuple
 
 from data_catalog.catalog import list_sequences
+from data_catalog.names import plain_name
 from extrags.errors import SourceNotFoundError, UnknownSequenceError
 from extrags.user_paths import expanded
 
@@ -34,8 +35,8 @@ def is_pattern(text: str) -> bool:
 
 
 def is_named(name: str, pattern: str) -> bool:
-    """Whether a text names a sequence, exactly or as a pattern: the folder of one may have brackets."""
-    return name == pattern or fnmatchcase(name, pattern)
+    """Whether a text names a sequence, in any spelling or as a pattern; folders may have brackets."""
+    return name in (pattern, plain_name(pattern)) or fnmatchcase(name, pattern)
 
 
 def matching_names(pattern: str) -> Matched:

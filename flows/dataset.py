@@ -11,6 +11,7 @@ from typing import Annotated, Any
 from prefect import flow
 from prefect.artifacts import create_markdown_artifact
 from prefect.client.schemas.objects import State
+from prefect.states import Failed
 from pydantic import Field
 
 from extrags.config import DEFAULT_PROFILE, ProfileName, Seed
@@ -22,7 +23,13 @@ from flows.expectation import Expectation, expectations, expected_words, longest
 from flows.leases import run_lease
 from flows.limits import DEFAULT_LIMITS, StageLimits
 from flows.methods import MethodName, profile_label
-from flows.outcome import DatasetFailedError, DatasetOutcome, SequenceFailedError, SequenceOutcome, StageRow
+from flows.outcome import (
+    DatasetFailedError,
+    DatasetOutcome,
+    SequenceFailedError,
+    SequenceOutcome,
+    failed_outcome,
+)
 from flows.pages import dataset_page
 from flows.parameters import Matrix, Sequences, Settings, StoreRoot
 from flows.preflight import preflight_cases
@@ -30,6 +37,7 @@ from flows.run_page import run_page
 from flows.runners import PrefectRunner, refreshed_once
 from flows.selection import chosen_sequences
 from flows.sequence import open_store, reconstruct_sequence
+from flows.server_contact import check_server
 from flows.settings import run_store, task_runner
 from flows.tables import dataset_markdown
 from flows.workloads import expected_work
@@ -91,6 +99,8 @@ def reconstruct_dataset(
     Raises:
         ConfigError: for wrong settings or manifests.
         UnknownSequenceError: for a pattern that matches nothing.
+        ServerLostError: when Prefect's server does not answer any more; a sequence whose run it missed for a
+            moment has failed, and the others go on.
         DatasetFailedError: when more than `max_failed_share` of the sequences failed; table and page have
             been written by then.
     """
@@ -114,22 +124,30 @@ def reconstruct_dataset(
     one = reconstruct_sequence.with_options(task_runner=task_runner(runner, at_once))
 
     def reconstruct(case: SequenceCase) -> SequenceOutcome:
-        state: State[Any] = one(
-            sequence=case.sequence,
-            profile=profile,
-            settings=dict(case.settings) or None,
-            seed=case.seed,
-            store=store,
-            refresh=refresh,
-            until=until,
-            method=case.method,
-            limits=limits,
-            variant=dict(case.changed) or None,
-            return_state=True,
-        )
+        state: State[Any]
+        lost: Exception | None = None
+        try:
+            state = one(
+                sequence=case.sequence,
+                profile=profile,
+                settings=dict(case.settings) or None,
+                seed=case.seed,
+                store=store,
+                refresh=refresh,
+                until=until,
+                method=case.method,
+                limits=limits,
+                variant=dict(case.changed) or None,
+                return_state=True,
+            )
+        except Exception as error:
+            # Not the run of the sequence, but what Prefect does round it: the others are tried all the same.
+            lost, state = error, Failed(message=str(error), data=error)
         outcome = _case_outcome(case, state, store, until)
         outcome.seed = case.seed if len(seeds or ()) > 1 else None
         page.sequence_ended(outcome, store)
+        if lost is not None:
+            check_server(lost)
         return outcome
 
     def run_all() -> DatasetOutcome:
@@ -223,9 +241,4 @@ def outcome_of(sequence: str, state: State[Any]) -> SequenceOutcome:
     # Not a stage but the run itself failed (a crash of its task runner, say).
     reason = str(found) if found is not None else state.name or "unknown"
     log.error("%s: %s", sequence, reason)
-    return SequenceOutcome(
-        sequence,
-        "failed",
-        [StageRow("ingest", "failed", reason=reason)],
-        error=found if isinstance(found, Exception) else None,
-    )
+    return failed_outcome(sequence, reason, found if isinstance(found, Exception) else None)

@@ -46,6 +46,7 @@ from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY
 from prefect.states import Crashed
 
 from extrags.store import Store
+from extrags.store.runs import FORGOTTEN_DAYS
 
 if TYPE_CHECKING:
     from prefect.client.schemas.objects import State
@@ -63,8 +64,6 @@ MISSED_BEATS = 3
 """So many must be missing."""
 PENDING_HOURS = 1.0
 """A run that has been about to start for so long was lost with its worker."""
-FORGOTTEN_DAYS = 30.0
-"""Leases that nobody holds are removed after this time, whatever the server knows of their runs."""
 PAGE = 200
 """Runs asked for at once, as many as Prefect gives."""
 
@@ -128,6 +127,7 @@ def settle_dead_runs(root: str, suspects: frozenset[UUID] = frozenset()) -> tupl
         The runs that were settled, and those that now miss their heartbeats.
     """
     settled, missing = [], set()
+    _sweep_unreadable(Store(root).state / "leases")
     free = {lease.flow_run: lease for lease in _free_leases(Store(root).state / "leases")}
     with get_client(sync_client=True) as client:
         for run in _unended(client):
@@ -248,7 +248,8 @@ def _settle(client: SyncPrefectClient, run: FlowRun, reason: str) -> bool:
 def _forget(client: SyncPrefectClient, lease: _Lease) -> None:
     """Remove the lease of a run that has ended, on any machine, or that is old.
 
-    A run that this server does not know may be another server's, which settles it by its lease.
+    After `FORGOTTEN_DAYS` it goes whatever the server knows of its run. A run that this server does not know
+    may be another server's, which settles it by its lease.
     """
     try:
         written = datetime.datetime.fromtimestamp(lease.path.stat().st_mtime, datetime.UTC)
@@ -304,6 +305,29 @@ def _free_leases(folder: Path) -> Iterator[_Lease]:
             if not _is_locked(path):
                 said = json.loads(path.read_bytes())
                 yield _Lease(path, UUID(said["flow_run"]), str(said["host"]))
+
+
+def _sweep_unreadable(folder: Path) -> None:
+    """Remove what a process that died while it wrote its lease has left, once it is old.
+
+    Of whose run it was, and on which machine, nothing tells: `settle_dead_runs` can make nothing of it.
+    """
+    readable = {lease.path for lease in _free_leases(folder)}
+    for path in sorted({*folder.glob("*.lease"), *folder.glob("*.part")} - readable):
+        try:
+            written = datetime.datetime.fromtimestamp(path.stat().st_mtime, datetime.UTC)
+            if _age_seconds(written) < FORGOTTEN_DAYS * 86400:
+                continue
+            # Of what this user may not open, the age alone decides.
+            with suppress(PermissionError):
+                if _is_locked(path):
+                    continue
+            path.unlink(missing_ok=True)
+            log.info("the lease %s cannot be read and is old: it is removed", path)
+        except FileNotFoundError:
+            continue
+        except OSError as error:
+            log.warning("the lease %s cannot be read, nor removed: %s", path, error.strerror)
 
 
 def _is_held(root: str, run: FlowRun) -> bool:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from extrags.errors import ExtragsError
+from extrags.redaction import without_credentials
 from extrags.stages import REGISTRY, Part
 from extrags.store import Ref
 
@@ -17,6 +18,7 @@ __all__ = [
     "SequenceOutcome",
     "StageRow",
     "StageState",
+    "failed_outcome",
 ]
 
 NOT_COUNTED = frozenset(stage.name for stage in REGISTRY if not stage.counted)
@@ -133,6 +135,18 @@ class SequenceOutcome:
             "artefacts": self.artefacts,
             "digests": self.digests,
         }
+
+
+def failed_outcome(sequence: str, reason: str, error: Exception | None = None) -> SequenceOutcome:
+    """Of a run that failed before any stage of it began, or round them: the first stage stands for it.
+
+    Args:
+        sequence: its name.
+        reason: why.
+        error: the exception, where there was one.
+    """
+    row = StageRow("ingest", "failed", reason=without_credentials(reason))
+    return SequenceOutcome(sequence, "failed", [row], error=error)
 
 
 @dataclass

@@ -5,12 +5,12 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
-from data_catalog.names import comparable_name
+from data_catalog.names import comparable_name, path_of
 from data_catalog.patterns import is_named
 from extrags.errors import ConfigError, StoreError, UnknownSequenceError
 from extrags.pipeline import HELD_OUT_TRAINED_ON
@@ -65,6 +65,19 @@ class RecordedRun:
     def sequence(self) -> str:
         """Its sequence."""
         return self.report.label if self.record is None else str(self.record["sequence"])
+
+    @property
+    def shown_name(self) -> str:
+        """What pages call its sequence; of a path the last part, since pages are sent to other machines.
+
+        Frames of equal content are one artefact, which knows the name of the source that was read first.
+        """
+        kept = self.report.config.get("name")
+        if kept:
+            return str(kept)
+        # Pages of earlier versions.
+        path = path_of(self.sequence) if self.record is None else self.record.get("path")
+        return Path(self.sequence).name if path else self.sequence
 
     @property
     def place(self) -> str:
@@ -274,7 +287,7 @@ def gallery_run(store: Store, run: RecordedRun) -> GalleryRun:
     traits = run.traits()
     known = _described(run.sequence)
     return GalleryRun(
-        sequence=store.load(EndoscopicSequence, frames),
+        sequence=replace(store.load(EndoscopicSequence, frames), name=run.shown_name),
         rgb=rgb,
         results=results,
         method=traits.get("method", ""),

@@ -23,11 +23,11 @@ from pydantic import Field
 
 from extrags.errors import StoreError
 from extrags.store import Store
-from extrags.store.retention import Policy, apply_policy, planned_removals
+from extrags.store.retention import Policy
+from flows.cleaning import clean_store
 from flows.leases import FLOWS, run_lease
 from flows.parameters import StoreRoot
 from flows.settings import run_store
-from tasks.locks import sweep_locks
 from tasks.run_page import artifact_key, attempt
 from tasks.stage import all_stage_versions
 
@@ -38,6 +38,10 @@ log = logging.getLogger(__name__)
 BATCH = 200
 """The most that a server returns at once."""
 DAY_S = 86400.0
+MOST_GIB = 2.0**40
+"""Larger than any store; without a bound, a number may be too large for bytes."""
+MOST_DAYS = 36_500.0
+"""A hundred years; dates do not go back for ever."""
 ENDED = [StateType.COMPLETED, StateType.FAILED, StateType.CANCELLED, StateType.CRASHED]
 
 
@@ -47,10 +51,17 @@ def retention(
         StoreRoot, Field(description="directory or URL of the artefact store; EXTRAGS_STORE by default")
     ] = None,
     older_than_days: Annotated[
-        float | None, Field(gt=0, description="remove artefacts not used for so long")
+        float | None,
+        Field(gt=0, le=MOST_DAYS, allow_inf_nan=False, description="remove artefacts not used for so long"),
     ] = None,
     max_gib: Annotated[
-        float | None, Field(ge=0, description="remove the least recently used until the store is no larger")
+        float | None,
+        Field(
+            ge=0,
+            le=MOST_GIB,
+            allow_inf_nan=False,
+            description="remove the least recently used until the store is no larger",
+        ),
     ] = None,
     keep_last: Annotated[
         int | None, Field(ge=1, description="of each sequence, keep what its last runs used")
@@ -60,27 +71,32 @@ def retention(
         bool, Field(description="also what kept artefacts were made from, except by max_gib")
     ] = False,
     flow_runs_days: Annotated[
-        float | None, Field(gt=0, description="delete flow runs of extrags that ended so long ago")
+        float | None,
+        Field(
+            gt=0,
+            le=MOST_DAYS,
+            allow_inf_nan=False,
+            description="delete flow runs of extrags that ended so long ago",
+        ),
     ] = None,
     dry_run: Annotated[bool, Field(description="only say what would be removed")] = False,
 ) -> dict[str, int]:
     """Clean the store and Prefect's database; runs that are going on are spared.
 
     Returns:
-        Numbers of `artefacts`, `bytes`, `leftovers` and `flow_runs` that were removed, or would be.
+        Numbers of `artefacts`, `bytes`, `leftovers` and `flow_runs` that were removed, or would be, and of
+        artefacts that were `skipped`, because their manifests cannot be read.
 
     Raises:
         ConfigError: for a store that is relative to where a worker was started.
-        StoreError: when there is no such store, or it cannot be used.
+        StoreError: when there is no such store, or something could not be removed; all else has been by
+            then, and the artifact says what.
     """
     store = run_store(store)
     place = Store(store)
     if not place.exists():
         raise StoreError(f"there is no store {store}")
     with run_lease(store):
-        leftovers = place.gc(dry_run=dry_run)
-        if not dry_run:
-            leftovers += sweep_locks(place.locks)
         policy = Policy(
             older_than_s=None if older_than_days is None else older_than_days * DAY_S,
             max_bytes=None if max_gib is None else int(max_gib * 2**30),
@@ -89,7 +105,8 @@ def retention(
             versions=all_stage_versions(),
             with_inputs=with_inputs,
         )
-        removed = planned_removals(place, policy)[0] if dry_run else apply_policy(place, policy)
+        cleaned = clean_store(place, policy, dry_run=dry_run)
+        removed = cleaned.artefacts.removed
         for item in removed:
             log.info("%s %s: %s", "would remove" if dry_run else "removed", item.key, item.reason)
         runs = 0
@@ -99,8 +116,9 @@ def retention(
     found = {
         "artefacts": len(removed),
         "bytes": sum(item.bytes for item in removed),
-        "leftovers": len(leftovers),
+        "leftovers": len(cleaned.leftovers),
         "flow_runs": runs,
+        "skipped": len(cleaned.artefacts.skipped),
     }
     lines = [f"| {name} | {count} |" for name, count in found.items()]
     attempt(
@@ -110,6 +128,7 @@ def retention(
             description=f"retention of {store}",
         )
     )
+    cleaned.check()
     return found
 
 

@@ -11,14 +11,15 @@ from pydantic import Field
 
 from data_catalog.names import plain_name
 from extrags.config import DEFAULT_PROFILE, ProfileName, Seed
+from extrags.errors import ExtragsError
 from extrags.stages import StageName
 from extrags.store import Store
-from extrags.store.runs import file_killed
+from extrags.store.runs import file_killed, sweep_unreadable
 from flows.cases import SequenceCase, record_outcome_quietly
 from flows.leases import is_inner_run, run_lease
 from flows.limits import DEFAULT_LIMITS, StageLimits
 from flows.methods import METHODS, MethodName, profile_label
-from flows.outcome import SequenceFailedError, SequenceOutcome
+from flows.outcome import SequenceFailedError, SequenceOutcome, failed_outcome
 from flows.parameters import Settings, StoreRoot
 from flows.preflight import preflight
 from flows.run_page import run_page
@@ -65,6 +66,8 @@ def reconstruct_sequence(
 
     Raises:
         SequenceFailedError: when a stage failed; what was finished stays in the store.
+        ExtragsError: when something is missing that the run needs (`flows.preflight.preflight`); that is on
+            record as well.
     """
     sequence = plain_name(sequence)
     case = SequenceCase(sequence, method, profile, seed, settings or {}, variant or {})
@@ -72,7 +75,14 @@ def reconstruct_sequence(
     store = run_store(store)
     with run_lease(store), run_page(sequence, config, until, work=expected_work(sequence, config)) as page:
         open_store(store)
-        preflight(config, until, METHODS[method].leave_out)
+        try:
+            preflight(config, until, METHODS[method].leave_out)
+        except ExtragsError as error:
+            # Runs inside a dataset are put on record there.
+            if not is_inner_run():
+                outcome = failed_outcome(sequence, str(error), error)
+                record_outcome_quietly(Store(store), case, outcome, until, config)
+            raise
         outcome = run_sequence(
             sequence,
             config,
@@ -113,6 +123,6 @@ def open_store(root: str) -> Store:
     store.check_writable()
     if is_inner_run():
         return store
-    for name in [*store.sweep(), *sweep_locks(store.locks), *file_killed(store)]:
+    for name in [*store.sweep(), *sweep_locks(store.locks), *file_killed(store), *sweep_unreadable(store)]:
         log.info("removed what a killed run left: %s", name)
     return store

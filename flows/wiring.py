@@ -105,6 +105,8 @@ class SequenceRun(CachedStages):
 
     _restored_shares: tuple[float, float] | None = None
     """Of restored views, where the scene knows the surface and elsewhere, from the judge of fine-tuning."""
+    _source_name = ""
+    """Of the source that was looked at; frames of equal content may have been read under another one."""
 
     def has_poses(self) -> bool:
         """Whether the source has camera poses."""
@@ -138,6 +140,7 @@ class SequenceRun(CachedStages):
         """The source becomes the artefact `sequence`."""
         with self._stage("ingest") as row:
             source = resolve(self.outcome.name)
+            self._source_name = source.name
             fingerprint = source_fingerprint(source, self.config.ingest)
             # The calibration file counts by its content, which is in the fingerprint.
             config = self.config.ingest.model_copy(update={"calibration": None})
@@ -470,6 +473,7 @@ class SequenceRun(CachedStages):
     def _page_inputs(self) -> dict[str, Any]:
         skipped = {item.stage: item.reason for item in self.outcome.stages if item.state == "skipped"}
         return {
+            "name": self._source_name,
             "parts": {part: self.refs[part] for part in REPORT_PARTS if part in self.refs},
             "skipped": skipped,
             "without_pose": self.frames_without_pose(),

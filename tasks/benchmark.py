@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from extrags.redaction import without_credentials, without_credentials_in
@@ -20,7 +21,7 @@ PER_VIEW_FILE = "per_view.json"
 
 # `rows` holds times and memory of the runs, `history` those of earlier ones. The page shows them, but they
 # are not part of its cache key; a run that measures anew makes its page anew as well.
-@stage("benchmark-report", version=8, ignore=("rows", "history"))
+@stage("benchmark-report", version=9, ignore=("rows", "history"))
 def benchmark_report(
     slot: Slot,
     name: str,
@@ -55,7 +56,7 @@ def benchmark_report(
     """
     from extrags.metrics.comparison import compare_runs
     from extrags.metrics.protocol import RenderedViews
-    from extrags.report.benchmark import BenchmarkInputs, ComparedViews, build_benchmark_report
+    from extrags.report.benchmark import BenchmarkInputs, ComparedViews, build_benchmark_report, run_label
     from extrags.report.comparison import RenderedMethod
     from extrags.sequence import EndoscopicSequence
 
@@ -68,7 +69,11 @@ def benchmark_report(
 
     compared = [
         ComparedViews(
-            slot.load(EndoscopicSequence, sequences[pair["baseline"]]),
+            # Frames of equal content are one artefact, whatever their sources are called.
+            replace(
+                slot.load(EndoscopicSequence, sequences[pair["baseline"]]),
+                name=run_label(runs[int(pair["baseline"])]),
+            ),
             pair["label"],
             rendered(pair["baseline"]),
             rendered(pair["contender"]),

@@ -32,9 +32,10 @@ REPORT_PARTS: tuple[Part, ...] = tuple(part for stage in REGISTRY for part in st
 
 # `rows` holds the times of the stages in this run. The page shows them, but they are not part of its cache
 # key.
-@stage("report", version=16, ignore=("rows",))
+@stage("report", version=17, ignore=("rows",))
 def report(
     slot: Slot,
+    name: str,
     parts: dict[str, Ref],
     skipped: dict[str, str],
     config: PipelineConfig,
@@ -46,6 +47,8 @@ def report(
 
     Args:
         slot: the artefact to write.
+        name: of the sequence. Its frames know one as well, but frames of equal content are one artefact,
+            which has the name of the source that was read first.
         parts: the artefacts to show, of `REPORT_PARTS`.
         skipped: why stages were skipped, by name.
         config: settings of the run, the plan's budgets included.
@@ -77,7 +80,7 @@ def report(
     curves = {stage: figures(stage, HISTORY) for stage in ("coarse", "finetune")}
     pseudo = part(PseudoViews, "enhance")
     inputs = ReportInputs(
-        name=sequence.name,
+        name=name,
         sequence=sequence,
         coarse=part(RenderedViews, "renders_coarse"),
         final=part(RenderedViews, "renders_final"),

@@ -17,7 +17,7 @@ from extrags.report.trend import trend_chart
 from extrags.report.wording import count, described_metrics, duration, number, percent, same_pixels
 from extrags.sequence import EndoscopicSequence
 
-__all__ = ["BenchmarkInputs", "ComparedViews", "build_benchmark_report"]
+__all__ = ["BenchmarkInputs", "ComparedViews", "build_benchmark_report", "run_label"]
 
 NO_CELL = {"value": "–", "verdict": "", "note": "", "better": ""}  # noqa: RUF001
 """A figure that was not measured."""
@@ -108,10 +108,13 @@ def build_benchmark_report(inputs: BenchmarkInputs) -> str:
             ),
             *shared_facts([run.get("image_size") for run in inputs.runs], settings),
         ],
-        given=given_settings([_label(run) for run in inputs.runs], settings),
+        given=given_settings([run_label(run) for run in inputs.runs], settings),
         methods=inputs.methods,
         failures=[
-            (f"{_label(run)}, {run['method']}, seed {run['seed']}", run["error"] or "no reason was recorded")
+            (
+                f"{run_label(run)}, {run['method']}, seed {run['seed']}",
+                run["error"] or "no reason was recorded",
+            )
             for run in inputs.runs
             if run["metrics"] is None
         ],
@@ -174,7 +177,7 @@ def _rows(
 ) -> list[dict[str, Any]]:
     return [
         {
-            "about": row["dataset"] if "dataset" in row else _label(row),
+            "about": row["dataset"] if "dataset" in row else run_label(row),
             "profile": row["profile"],
             "method": row["method"],
             "sizes": _sizes(row),
@@ -307,7 +310,8 @@ def _by_method(
     return found
 
 
-def _label(run: Mapping[str, Any]) -> str:
+def run_label(run: Mapping[str, Any]) -> str:
+    """The sequence of a run, with its setting where it has one."""
     return f"{run['sequence']}@{run['setting']}" if run["setting"] else str(run["sequence"])
 
 
@@ -318,5 +322,5 @@ def _several_profiles(runs: Sequence[Mapping[str, Any]]) -> bool:
 def _line_names(runs: Sequence[Mapping[str, Any]]) -> Callable[[Mapping[str, Any]], str]:
     """What a line of a chart is called; profiles have lines of their own where there are several."""
     if not _several_profiles(runs):
-        return _label
-    return lambda run: f"{_label(run)}, {run['profile']}"
+        return run_label
+    return lambda run: f"{run_label(run)}, {run['profile']}"

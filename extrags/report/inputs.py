@@ -158,7 +158,7 @@ class ReportInputs:
     """Everything a page can show of one sequence; what is None is left out, with a sentence saying why.
 
     Args:
-        name: the sequence as the user called it, e.g. `phantom/3@sparse`.
+        name: of the sequence, e.g. `phantom/3@sparse`; of a path its last part.
         sequence: frames, poses, masks, split.
         held_out: frames that were rendered, in that order; None means the test split.
         coarse: held-out views rendered from the coarse scene.

@@ -249,13 +249,16 @@ class Store:
         """Read all files of an artefact, on an object store the remote ones; what is wrong, or None.
 
         Raises:
-            StoreError: when the store cannot be read.
+            StoreError: when the store cannot be read, or a file for a reason that is no damage, such as
+                permissions.
         """
         try:
             manifest = self.backend.read_manifest(_checked(key))
+            damage = None if manifest is None else self.backend.examine(manifest)
         except StoreError as error:
             return _as_damage(error, key, self.root)
-        damage = None if manifest is None else self.backend.examine(manifest)
+        except OSError as error:
+            raise StoreError(f"{error.filename or key} cannot be read: {error.strerror or error}") from error
         return None if damage is None else self._damaged(key, damage)
 
     def verify(self, ref: Ref) -> bool:
@@ -423,6 +426,29 @@ class Store:
             if item is not None and _matches(pattern, item.key, item.stage, item.label)
         ]
         return sorted(chosen, key=lambda manifest: (manifest.started, manifest.key))
+
+    def manifests(self) -> tuple[list[Manifest], list[str]]:
+        """Manifests of all artefacts, and keys of those whose manifest cannot be read, with a warning each.
+
+        For who looks over a whole store, which one artefact that is damaged, or not for this user, must not
+        keep from the others.
+
+        Raises:
+            StoreError: when the store cannot be read. An object store that does not answer tells nothing of
+                a single artefact.
+        """
+        found, unreadable = [], []
+        for key in self.backend.names():
+            try:
+                manifest = self.backend.read_manifest(key)
+            except StoreError as error:
+                if "://" in self.root and not isinstance(error, DamagedArtefactError):
+                    raise
+                log.warning("%s is passed over: %s", key, error)
+                unreadable.append(key)
+            else:
+                found += [] if manifest is None else [manifest]
+        return sorted(found, key=lambda manifest: (manifest.started, manifest.key)), unreadable
 
     def _readable_manifest(self, key: str) -> Manifest | None:
         try:

@@ -133,7 +133,12 @@ def find_damage(directory: Path, manifest: Manifest, depth: Depth) -> Damage | N
     Raises:
         OSError: when a file cannot be read for a reason that is no damage, such as permissions.
     """
-    sizes = _sizes(directory)
+    try:
+        sizes = _sizes(directory)
+    except OSError as error:
+        if error.errno != errno.EIO:
+            raise
+        return Damage(f"cannot be listed: {error.strerror}")
     if depth == "sizes" and _as_counted(sizes, manifest):
         return None
     listed = _checksums(directory, manifest)

@@ -20,7 +20,7 @@ from extrags.store.artefacts import Store
 from extrags.store.manifest import Manifest, stage_of
 from extrags.store.runs import Run, active_runs, forget, runs_of
 
-__all__ = ["Policy", "Removal", "SequenceUsage", "apply_policy", "planned_removals", "usage"]
+__all__ = ["Cleaning", "Policy", "Removal", "SequenceUsage", "apply_policy", "planned_removals", "usage"]
 
 log = logging.getLogger(__name__)
 
@@ -69,6 +69,24 @@ class Removal:
 
 
 @dataclass(frozen=True)
+class Cleaning:
+    """What a policy removes, or has removed.
+
+    Args:
+        removed: the artefacts in the order of their removal, what was made from others before these.
+        runs: whose records go with them.
+        skipped: keys of artefacts whose manifest cannot be read: they stay, and neither what they were made
+            from nor when they were used is known.
+        refused: why others could not be removed, by key; they stay with what they were made from.
+    """
+
+    removed: list[Removal]
+    runs: list[Run]
+    skipped: list[str]
+    refused: dict[str, StoreError] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class SequenceUsage:
     """What the artefacts of a sequence use; those of several sequences count where they were first made.
 
@@ -100,7 +118,8 @@ class _Contents:
     """
 
     def __init__(self, store: Store, runs: Iterable[Run]) -> None:
-        self.manifests = {manifest.key: manifest for manifest in store.ls()}
+        found, self.unreadable = store.manifests()
+        self.manifests = {manifest.key: manifest for manifest in found}
         used = store.backend.last_used(self.manifests)
         self.used = {key: used.get(key, _made(item)) for key, item in self.manifests.items()}
         for run in runs:
@@ -132,9 +151,7 @@ class _Contents:
         return sorted(self.manifests, key=lambda key: (latest[key], -depth[key], key))
 
 
-def planned_removals(
-    store: Store, policy: Policy, *, now: float | None = None
-) -> tuple[list[Removal], list[Run]]:
+def planned_removals(store: Store, policy: Policy, *, now: float | None = None) -> Cleaning:
     """What a policy would remove.
 
     Args:
@@ -142,9 +159,8 @@ def planned_removals(
         policy: the rules.
         now: seconds since 1970.
 
-    Returns:
-        The artefacts in the order of their removal, what was made from others before these; and the runs
-        whose records go with them.
+    Raises:
+        StoreError: when the store cannot be read.
     """
     return _planned(policy, *_looked_over(store), time.time() if now is None else now)
 
@@ -160,7 +176,7 @@ def _looked_over(store: Store) -> tuple[_Contents, list[Run], list[Run]]:
 
 def _planned(
     policy: Policy, contents: _Contents, runs: list[Run], going_on: list[Run], now: float
-) -> tuple[list[Removal], list[Run]]:
+) -> Cleaning:
     runs = [replace(run, ended=max(run.ended, _last_time(run, contents))) for run in runs]
     kept_runs, former = _last_runs(_with_pages(runs, contents), policy.keep_last)
     of_kept = {key for run in kept_runs for key in run.keys}
@@ -199,24 +215,24 @@ def _planned(
     ]
     left = contents.manifests.keys() - removed.keys()
     gone = [run for run in runs if run in former or not run.keys & left]
-    return found, gone
+    return Cleaning(found, gone, contents.unreadable)
 
 
-def apply_policy(store: Store, policy: Policy) -> list[Removal]:
-    """Remove what a policy does not keep; returns what was removed.
+def apply_policy(store: Store, policy: Policy) -> Cleaning:
+    """Remove what a policy does not keep; returns what was removed, and what could not be.
 
     What cannot be removed, as an artefact of another user, stays with what it was made from, and hinders no
     other.
 
     Raises:
-        StoreError: when something could not be removed; all else has been by then.
+        StoreError: when the store cannot be read, or a record of a run not be removed.
     """
     contents, runs, going_on = _looked_over(store)
-    plan, gone = _planned(policy, contents, runs, going_on, time.time())
+    plan = _planned(policy, contents, runs, going_on, time.time())
     removed = []
     spared: set[str] = set()
     refused: dict[str, StoreError] = {}
-    for item in plan:
+    for item in plan.removed:
         # A run may have begun to use it since; then it needs what that was made from.
         if item.key not in spared:
             used = store.backend.last_used([item.key]).get(item.key, 0.0)
@@ -229,13 +245,9 @@ def apply_policy(store: Store, policy: Policy) -> list[Removal]:
             except StoreError as error:
                 refused[item.key] = error
                 spared |= contents.with_inputs([item.key])
-    forget(store, [run for run in gone if not run.keys & refused.keys()])
-    if refused:
-        first = next(iter(refused.values()))
-        raise StoreError(
-            f"{len(refused)} of {len(removed) + len(refused)} artefacts could not be removed: {first}"
-        ) from first
-    return removed
+    gone = [run for run in plan.runs if not run.keys & refused.keys()]
+    forget(store, gone)
+    return Cleaning(removed, gone, plan.skipped, refused)
 
 
 def usage(store: Store) -> list[SequenceUsage]:

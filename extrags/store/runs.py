@@ -18,15 +18,29 @@ import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from extrags.store.artefacts import Store
 from extrags.store.canonical import digest_of
 from extrags.store.records import read_records, remove_record, write_record
 
-__all__ = ["Run", "RunRecord", "active_runs", "file_killed", "forget", "recorded_run", "runs_of"]
+__all__ = [
+    "FORGOTTEN_DAYS",
+    "Run",
+    "RunRecord",
+    "active_runs",
+    "file_killed",
+    "forget",
+    "recorded_run",
+    "runs_of",
+    "sweep_unreadable",
+]
 
 log = logging.getLogger(__name__)
+
+FORGOTTEN_DAYS = 30.0
+"""What runs in progress have written of themselves, and nobody holds or can read, goes after this time."""
 
 _PREFIX = "run-"
 _LOOKS, _BETWEEN_LOOKS_S = 20, 0.05
@@ -188,6 +202,38 @@ def file_killed(store: Store) -> list[str]:
     return filed
 
 
+def sweep_unreadable(store: Store, *, dry_run: bool = False) -> list[str]:
+    """Remove records of runs in progress that cannot be read, and have not changed for `FORGOTTEN_DAYS`.
+
+    Half a record is what a full disk or a power loss leaves: what the run used is not known from it. One that
+    a process holds stays, and so does a young one, which may belong to a process of another machine.
+
+    Args:
+        store: whose.
+        dry_run: remove nothing.
+
+    Returns:
+        Names of the files that are gone, or would be.
+    """
+    removed = []
+    for path, run, going_on in _looked_at(store):
+        if run is not None or going_on:
+            continue
+        try:
+            if time.time() - path.stat().st_mtime < FORGOTTEN_DAYS * 86400:
+                continue
+            if not dry_run:
+                path.unlink()
+                log.info("the record %s of a run cannot be read and is old: it is removed", path)
+        except FileNotFoundError:
+            continue
+        except OSError as error:
+            log.warning("the record %s of a run cannot be read, nor removed: %s", path, error.strerror)
+            continue
+        removed.append(f"runs/active/{path.name}")
+    return removed
+
+
 def forget(store: Store, runs: Iterable[Run]) -> None:
     """Remove the records of runs that ended."""
     for run in runs:
@@ -202,11 +248,21 @@ def _record_name(sequence: str, place: str, keys: Iterable[str]) -> str:
 
 
 def _unfinished(store: Store) -> Iterator[tuple[Run, bool]]:
+    """Runs that have not recorded their end, and whether they are going on; those that can be read."""
+    return ((run, going_on) for _, run, going_on in _looked_at(store) if run is not None)
+
+
+def _looked_at(store: Store) -> Iterator[tuple[Path, Run | None, bool]]:
+    """Files of runs that have not recorded their end, what they say, and whether a process holds them."""
     folder = store.state / "runs" / "active"
     for path in sorted(folder.glob("*.json")) if folder.is_dir() else []:
         try:
             file = os.open(path, os.O_RDONLY)
         except FileNotFoundError:
+            continue
+        except OSError as error:
+            _say_unreadable(path, error)
+            yield path, None, False
             continue
         try:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
@@ -225,8 +281,15 @@ def _unfinished(store: Store) -> Iterator[tuple[Run, bool]]:
                 run = _parsed(f"active/{path.name}", path.read_bytes())
         except FileNotFoundError:
             continue  # It ended meanwhile; its record is among the others.
-        if run is not None:
-            yield run, going_on
+        except OSError as error:
+            _say_unreadable(path, error)
+            run = None
+        yield path, run, going_on
+
+
+def _say_unreadable(path: Path, error: OSError) -> None:
+    """Retention cannot spare what a run uses whose record may not be read."""
+    log.warning("the record %s of a run, and so what it uses, cannot be read: %s", path, error.strerror)
 
 
 def _write_all(file: int, text: bytes) -> None:

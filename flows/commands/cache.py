@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import logging
+import math
 import re
 import sys
+from collections.abc import Collection
 from typing import TYPE_CHECKING
 
 from extrags.errors import ConfigError, DamagedArtefactError, StoreError
@@ -16,6 +19,8 @@ if TYPE_CHECKING:
     from extrags.store import Store
 
 __all__ = ["add_arguments", "age_s", "gc", "ls", "rm", "size_bytes", "usage", "verify"]
+
+log = logging.getLogger(__name__)
 
 SECONDS = {"h": 3600.0, "d": 86400.0, "w": 7 * 86400.0}
 BYTES = {"": 1, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30, "TiB": 2**40}
@@ -80,7 +85,7 @@ def add_arguments(parser: Parser) -> None:
 
 
 def ls(given: argparse.Namespace) -> int:
-    """`extrags cache ls`; with `--verify`, exit code 1 when an artefact is damaged.
+    """`extrags cache ls`; with `--verify`, exit code 1 when an artefact is damaged or unreadable.
 
     Raises:
         StoreError: when there is no such store.
@@ -91,8 +96,9 @@ def ls(given: argparse.Namespace) -> int:
     from flows.terminal import console
 
     store = _looked_into(given)
-    manifests = store.ls(given.pattern)
-    damaged = [item.key for item in manifests if given.verify and store.examine(item.key)]
+    manifests = [item for pattern in _spellings(given.pattern) for item in store.ls(pattern)]
+    found, unreadable = _examined(store, [item.key for item in manifests] if given.verify else [])
+    damaged = [damage.key for damage in found]
     if given.json != "-":
         table = Table(box=None, pad_edge=False, header_style="bold")
         table.add_column("stage", no_wrap=True)
@@ -103,6 +109,7 @@ def ls(given: argparse.Namespace) -> int:
         table.add_column("key", overflow="fold")
         for item in manifests:
             mark = " [red]DAMAGED[/]" if item.key in damaged else ""
+            mark = " [red]UNREADABLE[/]" if item.key in unreadable else mark
             cost = (f"{item.seconds:.1f}", size_text(item.bytes))
             names = (escape(item.stage), escape(item.label), escape(item.started[:16]))
             table.add_row(*names, *cost, escape(item.key) + mark)
@@ -115,11 +122,11 @@ def ls(given: argparse.Namespace) -> int:
         for item in manifests
     ]
     write_json(rows, given.json)
-    return 1 if damaged else 0
+    return 1 if damaged or unreadable else 0
 
 
 def verify(given: argparse.Namespace) -> int:
-    """`extrags cache verify`; exit code 1 when an artefact is damaged, also if it is set aside.
+    """`extrags cache verify`; exit code 1 when an artefact is damaged, set aside or not, or unreadable.
 
     Raises:
         StoreError: when there is no such store.
@@ -127,14 +134,16 @@ def verify(given: argparse.Namespace) -> int:
     from rich.markup import escape
     from rich.table import Table
 
+    from extrags.store.manifest import stage_of
     from flows.terminal import console
 
     store = _looked_into(given)
-    checked, damaged = _examined(store)
-    aside = [store.set_aside(damage) if given.repair else None for damage in damaged]
+    keys = store.keys()
+    damaged, unreadable = _examined(store, keys)
+    aside = [_set_aside(store, damage) if given.repair else None for damage in damaged]
     if given.json != "-":
         out = console()
-        if damaged:
+        if damaged or unreadable:
             table = Table(box=None, pad_edge=False, header_style="bold")
             table.add_column("stage", no_wrap=True)
             for column in ("damage", "key", *(["set aside as"] if given.repair else [])):
@@ -143,8 +152,13 @@ def verify(given: argparse.Namespace) -> int:
                 what = f"{damage.file}: {damage.problem}" if damage.file else damage.problem
                 cells = (damage.stage, what, damage.key, *([place or ""] if given.repair else []))
                 table.add_row(*map(escape, cells))
+            for key, problem in unreadable.items():
+                table.add_row(*map(escape, (stage_of(key), problem, key)))
             out.print(table)
-        out.print(f"{len(damaged)} of {checked} artefacts damaged in {store.root}", markup=False)
+        out.print(f"{len(damaged)} of {len(keys)} artefacts damaged in {store.root}", markup=False)
+        if unreadable:
+            # They may be whole: whoever may read them can tell.
+            out.print(f"{counted(len(unreadable), 'artefact')} could not be read", markup=False)
         if damaged and not given.repair:
             out.print("with --repair they are set aside, and the next run makes them anew")
         elif damaged:
@@ -159,22 +173,55 @@ def verify(given: argparse.Namespace) -> int:
         }
         for damage, place in zip(damaged, aside, strict=True)
     ]
-    write_json({"store": store.root, "artefacts": checked, "damaged": rows}, given.json)
-    return 1 if damaged else 0
+    others = [{"stage": stage_of(key), "key": key, "problem": told} for key, told in unreadable.items()]
+    found = {"store": store.root, "artefacts": len(keys), "damaged": rows, "unreadable": others}
+    write_json(found, given.json)
+    return 1 if damaged or unreadable else 0
 
 
-def _examined(store: Store) -> tuple[int, list[DamagedArtefactError]]:
-    """Number of artefacts, and what is wrong with some of them; with a progress bar in a terminal."""
+def _set_aside(store: Store, damage: DamagedArtefactError) -> str | None:
+    """Where a damaged artefact is now; None where it stays, with a warning if it cannot be moved."""
+    try:
+        return store.set_aside(damage)
+    except StoreError as error:
+        log.warning("%s", error)
+        return None
+
+
+def _examined(store: Store, keys: Collection[str]) -> tuple[list[DamagedArtefactError], dict[str, str]]:
+    """What is wrong with some artefacts, and why others cannot be read, by key.
+
+    With a progress bar in a terminal.
+
+    Raises:
+        StoreError: when an object store does not answer, which tells nothing of a single artefact.
+    """
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     from flows.terminal import console
 
-    keys = store.keys()
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     bars = Progress(*columns, console=console(error=True), transient=True, disable=not sys.stderr.isatty())
+    damaged: list[DamagedArtefactError] = []
+    unreadable: dict[str, str] = {}
     with bars:
-        found = [store.examine(key) for key in bars.track(keys, description="reading")]
-    return len(keys), [damage for damage in found if damage is not None]
+        for key in bars.track(keys, description="reading"):
+            try:
+                damage = store.examine(key)
+            except StoreError as error:
+                if "://" in store.root:
+                    raise
+                unreadable[key] = str(error)
+            else:
+                damaged += [] if damage is None else [damage]
+    return damaged, unreadable
+
+
+def _spellings(pattern: str) -> list[str]:
+    """A pattern, and where it names a sequence of the catalogue in another spelling, what artefacts have."""
+    from data_catalog.names import plain_name
+
+    return list(dict.fromkeys((pattern, plain_name(pattern))))
 
 
 def rm(given: argparse.Namespace) -> int:
@@ -184,7 +231,9 @@ def rm(given: argparse.Namespace) -> int:
         StoreError: when there is no such store, or nothing in it matches.
     """
     store = _looked_into(given)
-    removed = [key for pattern in given.patterns for key in store.rm(pattern)]
+    removed = [
+        key for given_as in given.patterns for pattern in _spellings(given_as) for key in store.rm(pattern)
+    ]
     if not removed:
         raise StoreError(
             f"nothing in {store.root} matches {' or '.join(given.patterns)} (keys, stages and sequences as "
@@ -241,11 +290,12 @@ def gc(given: argparse.Namespace) -> int:
 
     Raises:
         ConfigError: for an age or a size that is none.
-        StoreError: when there is no such store.
+        StoreError: when there is no such store, or something could not be removed; all else has been by
+            then.
     """
     from dataclasses import asdict
 
-    from extrags.store.retention import Policy, apply_policy, planned_removals
+    from extrags.store.retention import Policy
 
     older_than_s = None if given.older_than is None else age_s(given.older_than)
     max_bytes = None if given.max_size is None else size_bytes(given.max_size)
@@ -253,12 +303,9 @@ def gc(given: argparse.Namespace) -> int:
         raise ConfigError(f"--keep-last {given.keep_last}: expected 1 or more")
     store = _looked_into(given)
     # Here, because they load Prefect, which wrong usage must not wait for.
-    from tasks.locks import sweep_locks
+    from flows.cleaning import clean_store
     from tasks.stage import all_stage_versions
 
-    leftovers = store.gc(dry_run=given.dry_run)
-    if not given.dry_run:
-        leftovers += sweep_locks(store.locks)
     policy = Policy(
         older_than_s=older_than_s,
         max_bytes=max_bytes,
@@ -267,7 +314,8 @@ def gc(given: argparse.Namespace) -> int:
         versions=all_stage_versions(),
         with_inputs=given.with_inputs,
     )
-    removed = planned_removals(store, policy)[0] if given.dry_run else apply_policy(store, policy)
+    cleaned = clean_store(store, policy, dry_run=given.dry_run)
+    leftovers, removed, skipped = cleaned.leftovers, cleaned.artefacts.removed, cleaned.artefacts.skipped
     if given.json != "-":
         for name in leftovers:
             print(name)
@@ -277,8 +325,12 @@ def gc(given: argparse.Namespace) -> int:
         print(f"{counted(len(leftovers), 'leftover')} {would}removed from {store.root}")
         freed = size_text(sum(item.bytes for item in removed))
         print(f"{counted(len(removed), 'artefact')} of {freed} {would}removed")
+        if skipped:
+            print(f"{counted(len(skipped), 'artefact')} skipped, whose manifests cannot be read")
     rows = [asdict(item) for item in removed]
-    write_json({"dry_run": given.dry_run, "leftovers": leftovers, "artefacts": rows}, given.json)
+    found = {"dry_run": given.dry_run, "leftovers": leftovers, "artefacts": rows, "skipped": skipped}
+    write_json(found, given.json)
+    cleaned.check()
     return 0
 
 
@@ -303,7 +355,10 @@ def size_bytes(text: str) -> int:
     found = re.fullmatch(r"(\d+(?:\.\d+)?) ?([KMGT]iB|)", text)
     if found is None:
         raise ConfigError(f"{text!r} is no size; expected a number with KiB, MiB, GiB or TiB, such as 50GiB")
-    return int(float(found[1]) * BYTES[found[2]])
+    size = float(found[1]) * BYTES[found[2]]
+    if math.isinf(size):
+        raise ConfigError(f"{text[:20]}... is larger than any store")
+    return int(size)
 
 
 def _looked_into(given: argparse.Namespace) -> Store:

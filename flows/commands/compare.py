@@ -78,7 +78,7 @@ def compare(given: argparse.Namespace) -> int:
     first = refs[0]
     if first is None:
         raise ConfigError(f"{runs[0].sequence}: its page {runs[0].report.key} knows no frames")
-    sequence = store.load(EndoscopicSequence, first)
+    sequence = replace(store.load(EndoscopicSequence, first), name=runs[0].shown_name)
     # Most runs share their frames, which may be gigabytes.
     digests = {first: held_out_digest(sequence)}
     for ref in refs:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from extrags.errors import (
     ConfigError,
     DamagedArtefactError,
+    ExtragsError,
 )
 from flows.commands.common import (
     items,
@@ -38,7 +39,7 @@ from flows.commands.options import (
 from flows.commands.run_checks import check_names, check_working_distance, wrong_source
 from flows.failures import describe_error
 from flows.interruption import RESUMABLE, say_when_interrupted
-from flows.outcome import DatasetFailedError, DatasetOutcome, SequenceOutcome
+from flows.outcome import DatasetFailedError, DatasetOutcome, SequenceOutcome, failed_outcome
 
 if TYPE_CHECKING:
     from extrags.stages import StageName
@@ -257,7 +258,14 @@ def execute(
     from flows.preflight import preflight_cases
     from flows.selection import absolute_manifests
 
-    preflight_cases(cases, until)
+    try:
+        preflight_cases(cases, until)
+    except ConfigError:
+        raise  # Wrong usage is no run.
+    except ExtragsError as error:
+        if len(cases) == 1:
+            _record(cases[0], failed_outcome(cases[0].sequence, str(error), error), root, until)
+        raise
 
     # Names were checked by the parser; flows have literals for them.
     arguments: dict[str, Any] = {

@@ -21,7 +21,30 @@ def test_a_path_that_exists_has_one_spelling(spelling: str) -> None:
     assert plain_name(spelling) == "grow"
 
 
-@pytest.mark.parametrize("name", ["phantom/0@sparse", "./phantom/0", "elsewhere/", "x" * 5000, "a\0b"])
+@pytest.mark.parametrize(
+    ("spelling", "name"),
+    [
+        ("phantom/0", "phantom/0@sparse"),
+        ("phantom/00@distanced", "phantom/0@distanced"),
+        ("caverns/7", "caverns/7@sparse"),
+        ("c3vdv2/c1_cecum_t1", "c3vdv2/c1_cecum_t1@sparse"),
+        ("simcol3d_s1", "simcol3d/s1"),
+    ],
+)
+def test_a_sequence_of_the_catalogue_has_the_name_it_is_listed_by(
+    spelling: str, name: str, here: Path
+) -> None:
+    assert plain_name(spelling) == plain_name(name) == name
+    assert comparable_name(spelling) == comparable_name(name)
+    # A path that exists wins.
+    (here / spelling).mkdir(parents=True)
+    assert plain_name(spelling) == spelling
+    assert comparable_name(spelling) == str(here / spelling)
+
+
+@pytest.mark.parametrize(
+    "name", ["phantom/0@sparse", "phantom/0@dense", "./phantom/0", "elsewhere/", "x" * 5000, "a\0b"]
+)
 def test_what_does_not_exist_stays_as_it_is(name: str) -> None:
     assert plain_name(name) == name
 

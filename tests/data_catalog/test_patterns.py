@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from data_catalog.patterns import is_pattern, matching_names
+from data_catalog.patterns import is_named, is_pattern, matching_names
 from extrags.errors import SourceNotFoundError, UnknownSequenceError
 
 
@@ -45,3 +45,9 @@ def test_a_path_that_exists_is_no_pattern(tmp_path: Path) -> None:
     assert not is_pattern(str(odd))
     assert not is_pattern("phantom/0@sparse")
     assert is_pattern("phantom/?@sparse")
+
+
+def test_a_name_is_that_of_a_sequence_in_any_spelling() -> None:
+    assert is_named("phantom/0@sparse", "phantom/0")
+    assert is_named("scans/a [x]", "scans/a [x]")
+    assert not is_named("phantom/0@distanced", "phantom/0")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import errno
+import fcntl
 import json
 import os
 import subprocess
@@ -20,7 +21,7 @@ from extrags.store import Ref, Store
 from extrags.store.directory import DirectoryBackend
 from extrags.store.records import remove_record
 from extrags.store.retention import Policy, Removal, apply_policy, planned_removals, usage
-from extrags.store.runs import active_runs, file_killed, recorded_run, runs_of
+from extrags.store.runs import active_runs, file_killed, recorded_run, runs_of, sweep_unreadable
 
 DAY_S = 86400.0
 
@@ -45,7 +46,7 @@ def names(removals: list[Removal]) -> list[str]:
 
 
 def planned(store: Store, **policy: object) -> list[str]:
-    return names(planned_removals(store, Policy(**policy))[0])  # type: ignore[arg-type]
+    return names(planned_removals(store, Policy(**policy)).removed)  # type: ignore[arg-type]
 
 
 @pytest.fixture
@@ -77,7 +78,9 @@ class TestAge:
     def test_nothing_of_now_is_removed(self, store: Store) -> None:
         put(store, "ingest")
         assert planned(store, older_than_s=0.0, max_bytes=0, unreachable=True) == []
-        assert names(planned_removals(store, Policy(max_bytes=0), now=time.time() + DAY_S)[0]) == ["ingest"]
+        assert names(planned_removals(store, Policy(max_bytes=0), now=time.time() + DAY_S).removed) == [
+            "ingest"
+        ]
 
 
 class TestSize:
@@ -201,7 +204,7 @@ class TestRuns:
     def test_what_no_run_used_is_unreachable(self, three: Store) -> None:
         put(three, "tried", days=1)
         assert planned(three, unreachable=True) == ["tried"]
-        gone = apply_policy(three, Policy(unreachable=True, keep_last=1))
+        gone = apply_policy(three, Policy(unreachable=True, keep_last=1)).removed
         assert sorted(names(gone)) == ["final0", "final1", "judged0", "judged1", "tried"]
         assert len(runs_of(three)) == 2
 
@@ -233,7 +236,7 @@ class TestRuns:
         assert list((chain.state / "runs" / "active").iterdir()) == []
         (filed,) = runs_of(chain)
         assert (filed.keys, filed.ended) == (run.keys, run.ended)
-        assert len(apply_policy(chain, Policy(older_than_s=DAY_S))) == 4
+        assert len(apply_policy(chain, Policy(older_than_s=DAY_S)).removed) == 4
         assert runs_of(chain) == []
 
     def test_damaged_records_are_left_out(self, three: Store) -> None:
@@ -250,8 +253,8 @@ class TestRuns:
             record.add(["ingest-v1-00", Path(final.uri).name])
         assert store.keys() == ["ingest-v1-00", "other-v1-00", "report-v1-00"]
         later = time.time() + DAY_S
-        assert names(planned_removals(store, Policy(unreachable=True), now=later)[0]) == ["other"]
-        assert len(planned_removals(store, Policy(older_than_s=3600.0), now=later)[0]) == 3
+        assert names(planned_removals(store, Policy(unreachable=True), now=later).removed) == ["other"]
+        assert len(planned_removals(store, Policy(older_than_s=3600.0), now=later).removed) == 3
         remove_record(store, runs_of(store)[0].name)
         assert runs_of(store) == []
 
@@ -270,8 +273,8 @@ class TestRuns:
                 assert record is not None
                 record.add(["ingest-v1-00", "report-v1-00"])
         old = Policy(older_than_s=90 * DAY_S)
-        assert names(planned_removals(store, old, now=nights + DAY_S)[0]) == ["other"]
-        assert len(planned_removals(store, old, now=nights + 91 * DAY_S)[0]) == 3
+        assert names(planned_removals(store, old, now=nights + DAY_S).removed) == ["other"]
+        assert len(planned_removals(store, old, now=nights + 91 * DAY_S).removed) == 3
         (row,) = usage(store)
         assert row.used == told[:19] + "+00:00"
 
@@ -280,9 +283,9 @@ class TestVersions:
     def test_what_earlier_versions_made_goes_and_what_later_ones_made_stays(self, chain: Store) -> None:
         assert planned(chain, versions={"report": 1, "elsewhere": 7}) == []
         assert planned(chain, versions={"report": 0, "other": 0}) == []
-        (found,), _ = planned_removals(chain, Policy(versions={"report": 2}))
+        (found,) = planned_removals(chain, Policy(versions={"report": 2})).removed
         assert (found.key, found.reason) == ("report-v1-00", "of version 1 of its stage, which is at 2")
-        assert names(apply_policy(chain, Policy(versions={"report": 2}))) == ["report"]
+        assert names(apply_policy(chain, Policy(versions={"report": 2})).removed) == ["report"]
         assert len(chain.keys()) == 3
 
     def test_what_a_kept_artefact_was_made_from_stays(self, chain: Store) -> None:
@@ -295,8 +298,8 @@ class TestVersions:
         with recorded_run(chain, "phantom/0") as record:
             assert record is not None
             record.add(["other-v1-00"])
-            assert apply_policy(chain, Policy(versions={"other": 2})) == []
-        assert names(apply_policy(chain, Policy(versions={"other": 2}))) == ["other"]
+            assert apply_policy(chain, Policy(versions={"other": 2})).removed == []
+        assert names(apply_policy(chain, Policy(versions={"other": 2})).removed) == ["other"]
 
     def test_what_was_used_a_moment_ago_stays(self, chain: Store) -> None:
         assert chain.find("other-v1-00") is not None
@@ -316,7 +319,7 @@ def test_nothing_is_removed_that_a_run_has_begun_to_use_since(
         return plan
 
     monkeypatch.setattr(retention, "_planned", and_then_it_is_found)
-    assert names(apply_policy(chain, Policy(older_than_s=DAY_S))) == ["report", "other"]
+    assert names(apply_policy(chain, Policy(older_than_s=DAY_S)).removed) == ["report", "other"]
     assert chain.keys() == ["coarse-v1-00", "ingest-v1-00"]
 
 
@@ -329,10 +332,30 @@ def test_what_cannot_be_removed_hinders_no_other(chain: Store, monkeypatch: pyte
         return usual(backend, key)
 
     monkeypatch.setattr(DirectoryBackend, "discard", discard)
-    with pytest.raises(StoreError, match=r"1 of 3 artefacts could not be removed: coarse-v1-00 cannot"):
-        apply_policy(chain, Policy(older_than_s=0.0, with_inputs=True))
+    done = apply_policy(chain, Policy(older_than_s=0.0, with_inputs=True))
+    assert names(done.removed) == ["report", "other"]
+    assert {key: str(error) for key, error in done.refused.items()} == {
+        "coarse-v1-00": "coarse-v1-00 cannot be removed: Permission denied"
+    }
     # It stays with what it was made from.
     assert chain.keys() == ["coarse-v1-00", "ingest-v1-00"]
+
+
+@pytest.mark.parametrize("unreadable", [False, True])
+def test_a_manifest_that_cannot_be_read_hinders_no_other(
+    chain: Store, unreadable: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    manifest = Path(chain.root) / "artefacts" / "other-v1-00" / "manifest.json"
+    manifest.unlink()
+    if unreadable:
+        manifest.mkdir()
+    else:
+        manifest.write_text("{")
+    assert planned(chain, older_than_s=15 * DAY_S) == []
+    done = apply_policy(chain, Policy(older_than_s=5 * DAY_S))
+    assert (names(done.removed), done.skipped) == (["report", "coarse", "ingest"], ["other-v1-00"])
+    assert "other-v1-00 is passed over: " in caplog.text
+    assert [row.artefacts for row in usage(chain)] == []
 
 
 def test_usage(chain: Store) -> None:
@@ -407,6 +430,59 @@ def test_a_record_that_is_half_written_is_read_again(store: Store, monkeypatch: 
         monkeypatch.setattr("time.sleep", lambda _: path.write_bytes(whole))
         (run,) = active_runs(store)
         assert run.keys == {"ingest-v1-00"}
+
+
+@pytest.mark.parametrize(
+    ("content", "days", "held", "kept"),
+    [
+        ('{"sequence": ', 31, False, False),
+        ("", 31, False, False),
+        ("", 29, False, True),
+        ("", 31, True, True),
+        ('{"sequence": "a", "ended": "2026-01-01", "keys": []}', 31, False, True),
+    ],
+)
+def test_records_of_runs_that_nobody_can_read_go_when_they_are_old(
+    content: str,
+    days: float,
+    held: bool,
+    kept: bool,
+    store: Store,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    monkeypatch.setattr("time.sleep", lambda _: None)
+    caplog.set_level("INFO")
+    path = store.state / "runs" / "active" / "0123.json"
+    path.parent.mkdir(parents=True)
+    path.write_text(content)
+    os.utime(path, (time.time() - days * DAY_S,) * 2)
+    with path.open() as file:
+        if held:
+            fcntl.flock(file, fcntl.LOCK_EX)
+        found = sweep_unreadable(store, dry_run=True)
+        assert path.exists()
+        assert sweep_unreadable(store) == found == ([] if kept else ["runs/active/0123.json"])
+    assert path.exists() is kept
+    assert ("cannot be read and is old: it is removed" in caplog.text) is not kept
+
+
+def test_a_record_that_may_not_be_read_stops_nobody(
+    store: Store, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = store.state / "runs" / "active" / "0123.json"
+    path.parent.mkdir(parents=True)
+    path.write_text("{}")
+    usual = os.open
+
+    def opened(place: Path, *given: int, **more: int) -> int:
+        if place == path:
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return usual(place, *given, **more)
+
+    monkeypatch.setattr(os, "open", opened)
+    assert (active_runs(store), runs_of(store), file_killed(store)) == ([], [], [])
+    assert "what it uses, cannot be read: Permission denied" in caplog.text
 
 
 def test_a_record_is_plain_json(store: Store) -> None:

@@ -245,6 +245,25 @@ class TestOpen:
         with pytest.raises(DamagedArtefactError, match=f"artefact {KEY} .*about.json: its content"):
             place.store.load_json("about.json", ref)
 
+    @pytest.mark.parametrize(("number", "damaged"), [(errno.EIO, True), (errno.EACCES, False)])
+    def test_a_folder_that_cannot_be_listed(
+        self, number: int, damaged: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        store = Store(tmp_path)
+        put(store)
+
+        def scandir(place: str) -> object:
+            raise OSError(number, os.strerror(number), str(place))
+
+        monkeypatch.setattr("extrags.store.integrity.os.scandir", scandir)
+        if damaged:
+            found = store.examine(KEY)
+            assert found is not None
+            assert found.problem == "cannot be listed: Input/output error"
+        else:
+            with pytest.raises(StoreError, match="cannot be read: Permission denied"):
+                store.examine(KEY)
+
     def test_an_error_that_is_none_of_the_store_stays_what_it_is(self, tmp_path: Path) -> None:
         store = Store(tmp_path)
         ref = put(store)

@@ -31,7 +31,7 @@ from flows.runners import DirectRunner, StoreRunner
 from flows.wiring import run_sequence
 from tasks.stage import StageKey
 from tests.flows.cache_key_tables import DIRECTLY, EXPLORE, FOLLOWS, OTHERS
-from tests.flows.recorded_keys import RecordedRun, recorded_keys, recorded_run
+from tests.flows.recorded_keys import KEPT, RecordedRun, recorded_keys, recorded_run
 from tests.flows.tiny import SEQUENCE, tiny_config
 
 SETTINGS = settings_of(PipelineConfig)
@@ -310,6 +310,11 @@ class TestContent:
         before = recorded_keys(str(source), BASE, has_poses=True, has_depth=True)
         copy = shutil.copytree(source, tmp_path / "elsewhere" / "source")
         assert recorded_keys(str(copy), BASE, has_poses=True, has_depth=True) == before
+        # Of another name it is the same content, and has a page of its own.
+        other = RecordedRun(has_poses=True, has_depth=True, judgement=KEPT)
+        recorded_run(str(shutil.copytree(source, tmp_path / "renamed")), BASE, other)
+        assert changed(before, dict(other.keys)) == {"report"}
+        assert other.inputs["report"]["name"] == "renamed"
         poses = copy / "poses.json"
         text = poses.read_text()
         position = next(index for index, letter in enumerate(text) if letter in "2345678")

@@ -343,12 +343,42 @@ class TestCache:
         found = json.loads(capsys.readouterr().out)
         assert undocumented(found, "cache-verify") == []
         (row,) = found.pop("damaged")
-        assert found == {"store": store, "artefacts": 3}
+        assert found == {"store": store, "artefacts": 3, "unreadable": []}
         assert (row["stage"], row["key"], row["file"]) == ("toy", "toy-v1-1", "file")
         assert (Path(row["set_aside"]) / "damage.json").is_file()
         assert main(["cache", "verify", "--store", store]) == 0
         assert "0 of 2 artefacts" in capsys.readouterr().out
         assert Store(store).find("toy-v1-1") is None
+
+    @pytest.mark.parametrize("number", [errno.EACCES, errno.EIO])
+    def test_verify_goes_on_where_a_file_cannot_be_read(
+        self, number: int, store: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        usual = Path.open
+
+        def opened(path: Path, *given: Any, **more: Any) -> Any:
+            if path.parent.name == "toy-v1-1" and path.name == "file":
+                raise OSError(number, os.strerror(number), str(path))
+            return usual(path, *given, **more)
+
+        monkeypatch.setattr(Path, "open", opened)
+        (Path(store) / "artefacts" / "toy-v1-2" / "file").write_text("y" * 2000)
+        assert main(["cache", "ls", "--verify", "--store", store]) == 1
+        assert ("UNREADABLE" in capsys.readouterr().out) is (number == errno.EACCES)
+        assert main(["cache", "verify", "--repair", "--store", store, "--json", "-"]) == 1
+        found = json.loads(capsys.readouterr().out)
+        assert undocumented(found, "cache-verify") == []
+        damaged = {row["key"]: row["problem"] for row in found["damaged"]}
+        unreadable = {row["key"]: row["problem"] for row in found["unreadable"]}
+        changed = {"toy-v1-2": "its content has changed since it was stored"}
+        if number == errno.EIO:
+            assert damaged == {"toy-v1-1": "cannot be read: Input/output error", **changed}
+            assert unreadable == {}
+        else:
+            # It may be whole: it stays where it is.
+            assert damaged == changed
+            assert unreadable["toy-v1-1"].endswith("toy-v1-1/file cannot be read: Permission denied")
+            assert (Path(store) / "artefacts" / "toy-v1-1").is_dir()
 
     def test_verify_wants_a_store(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert main(["cache", "verify", "--store", str(tmp_path / "none")]) == 1
@@ -360,6 +390,15 @@ class TestCache:
         assert [manifest.key for manifest in Store(store).ls()] == ["toy-v1-1"]
         assert main(["cache", "rm", "toy-v1-1", "--store", store]) == 0
         assert "1 artefact removed" in capsys.readouterr().out
+
+    def test_sequences_are_found_by_any_spelling(
+        self, store: str, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        with Store(store).slot(stage="toy", version=1, key="toy-v1-7", label="phantom/7@sparse"):
+            pass
+        assert main(["cache", "ls", "phantom/7", "--store", store, "--json", "-"]) == 0
+        assert [item["key"] for item in json.loads(capsys.readouterr().out)] == ["toy-v1-7"]
+        assert main(["cache", "rm", "phantom/7", "--store", store]) == 0
 
     def test_labels_are_told_with_their_brackets(
         self, store: str, capsys: pytest.CaptureFixture[str]

@@ -230,7 +230,7 @@ def test_what_it_went_on_from_is_kept(folder: Path, store: str) -> None:
     run(folder, store)
     later = 1e10
     policy = Policy(keep_last=1, unreachable=True)
-    gone = {item.key for item in planned_removals(Store(store), policy, now=later)[0]}
+    gone = {item.key for item in planned_removals(Store(store), policy, now=later).removed}
     assert not gone & {made(first, store).key, made(first, store).input_keys["sequence"]}
 
 

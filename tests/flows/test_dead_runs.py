@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import errno
+import fcntl
 import os
 import signal
 import subprocess
@@ -225,6 +226,47 @@ def test_leases_of_runs_that_ended_go_wherever_they_ran(
     monkeypatch.setattr(flows.leases, "get_client", lambda **_: Client())
     assert settle_dead_runs(str(tmp_path)) == ([], set())
     assert lease.exists() is kept
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "days", "held", "kept"),
+    [
+        ("a.part", '{"flow_run": "', 31, False, False),
+        ("a.part", '{"flow_run": "', 29, False, True),
+        ("a.part", '{"flow_run": "', 31, True, True),
+        ("a.lease", "", 31, False, False),
+        ("a.lease", '{"host": "here"}', 31, False, False),
+        ("a.lease", "[]", 29, False, True),
+    ],
+)
+def test_leases_that_nobody_can_read_go_when_they_are_old(
+    name: str,
+    content: str,
+    days: float,
+    held: bool,
+    kept: bool,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """Whether or not a server answers."""
+
+    def gone(**_: object) -> None:
+        raise ConnectionError("no server")
+
+    monkeypatch.setattr(flows.leases, "get_client", gone)
+    caplog.set_level("INFO")
+    lease = tmp_path / "leases" / name
+    lease.parent.mkdir()
+    lease.write_text(content)
+    os.utime(lease, (time.time() - days * DAY_S,) * 2)
+    with lease.open() as file:
+        if held:
+            fcntl.flock(file, fcntl.LOCK_EX)
+        with pytest.raises(ConnectionError):
+            settle_dead_runs(str(tmp_path))
+    assert lease.exists() is kept
+    assert ("cannot be read and is old: it is removed" in caplog.text) is not kept
 
 
 def test_a_run_that_never_started_is_dead_after_an_hour(

@@ -58,11 +58,11 @@ def test_it_links_the_pages_of_this_run_and_keeps_them(tmp_path: Path) -> None:
         os.utime(place, (1e9, 1e9))
     former, old = Policy(keep_last=1, unreachable=True), Policy(older_than_s=86400.0)
     for policy in (former, old):
-        gone, _ = planned_removals(store, policy)
+        gone = planned_removals(store, policy).removed
         assert {item.key for item in gone} == {"report-v12-one", first.parent.name}
     # A page that is kept keeps what it links to, however old.
     os.utime(first.parent)
-    assert planned_removals(store, old)[0] == []
+    assert planned_removals(store, old).removed == []
 
 
 def report(store: Store, views: str) -> Ref:

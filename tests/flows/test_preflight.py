@@ -22,8 +22,10 @@ from flows.cases import SequenceCase
 from flows.cli import main
 from flows.methods import METHODS
 from flows.outcome import SequenceOutcome
+from flows.outcome_records import outcome_records
 from flows.preflight import preflight, preflight_cases
 from flows.runners import DirectRunner, NotInStoreError, StoreRunner
+from flows.sequence import reconstruct_sequence
 from flows.settings import pipeline_config
 from flows.wiring import run_sequence
 from tasks.enhance import train
@@ -126,6 +128,33 @@ class TestSentences:
             f"{', '.join(usable_isas())}\n"
         )
         assert not list(tmp_path.glob("artefacts/*"))
+
+
+class TestRecords:
+    """What fails before its first stage is on record like any run that failed; wrong usage is no run."""
+
+    @pytest.mark.parametrize(
+        ("setting", "recorded"),
+        [("enhance.pretrained_weights=no/such.safetensors", True), ("enhance.backend=dynamicrafter", False)],
+    )
+    def test_a_command(
+        self, setting: str, recorded: bool, run: Callable[..., tuple[int, str]], tmp_path: Path
+    ) -> None:
+        _, said = run(setting)
+        records = list(outcome_records(Store(tmp_path / "store")).values())
+        assert [(item["sequence"], item["status"], item["reason"]) for item in records] == (
+            [(SEQUENCE, "failed", said)] if recorded else []
+        )
+
+    @pytest.mark.parametrize("inner", [False, True])
+    def test_a_flow(self, inner: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Inside a dataset, that one sees to it."""
+        monkeypatch.setattr("flows.sequence.is_inner_run", lambda: inner)
+        with pytest.raises(WeightsError, match="no/such"):
+            reconstruct_sequence.fn(SEQUENCE, profile="quick", settings=MISSING, store=str(tmp_path))
+        records = list(outcome_records(Store(tmp_path)).values())
+        assert [item["stage"] for item in records] == ([] if inner else ["ingest"])
+        assert all("no/such" in item["reason"] for item in records)
 
 
 class TestWhatIsLookedFor:

@@ -16,7 +16,7 @@ from extrags import __version__
 from extrags.errors import ConfigError, StoreError
 from extrags.pipeline import HELD_OUT_TRAINED_ON
 from extrags.sequence import EndoscopicSequence
-from extrags.store import Store, write_record
+from extrags.store import Manifest, Store, write_record
 from extrags.store.records import remove_record
 from flows.cases import SequenceCase, record_outcome
 from flows.cli import main
@@ -291,6 +291,36 @@ def test_what_a_scene_has_seen_is_said(reason: str, config: dict[str, Any], said
     shown = gallery_run(store, seen).held_out
     assert shown.startswith(said)
     assert bool(shown) == bool(said)
+
+
+def test_pages_of_runs_are_named_after_the_run_not_after_its_frames(
+    store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Frames of equal content are one artefact, which has the name of the source that was read first."""
+    renamed = [
+        replace(run, report=run.report.model_copy(update={"config": {**run.report.config, "name": "copy"}}))
+        for run in chosen_runs(store, [SEQUENCE])
+    ]
+    assert gallery_run(store, renamed[0]).sequence.name == "copy"
+    monkeypatch.setattr("flows.recorded_runs.chosen_runs", lambda *_, **__: renamed)
+    page = tmp_path / "page.html"
+    assert main(["compare", SEQUENCE, "--views", "1", "--store", store.root, "--output", str(page)]) == 0
+    assert "<title>copy" in page.read_text()
+
+
+@pytest.mark.parametrize(
+    ("sequence", "path", "config", "name"),
+    [
+        ("phantom/0@sparse", None, {}, "phantom/0@sparse"),
+        ("scans/colon", "/data/scans/colon", {}, "colon"),
+        ("scans/colon", "/data/scans/colon", {"name": "kept"}, "kept"),
+    ],
+)
+def test_what_a_run_is_called_on_pages(
+    sequence: str, path: str | None, config: dict[str, Any], name: str
+) -> None:
+    page = Manifest(stage="report", version=1, key="report-v1-a", digest="", config=config)
+    assert RecordedRun(page, {"sequence": sequence, "path": path}).shown_name == name
 
 
 def test_boards_know_what_has_seen_held_out_frames(store: Store, tmp_path: Path) -> None:

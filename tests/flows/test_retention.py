@@ -52,7 +52,7 @@ def test_a_run_that_only_finds_everything_uses_everything(
     store: Store, finished: tuple[str, SequenceOutcome]
 ) -> None:
     run_sequence(SEQUENCE, tiny_config(), store.root, StoreRunner(store.root), profile="quick")
-    removals, _ = planned_removals(store, Policy(older_than_s=30 * 86400.0), now=time.time() + 3600.0)
+    removals = planned_removals(store, Policy(older_than_s=30 * 86400.0), now=time.time() + 3600.0).removed
     made = {key for row in finished[1].stages for key in row.made}
     assert not made & {item.key for item in removals}
 
@@ -70,7 +70,9 @@ def test_removal_beside_a_run_changes_nothing_in_it(
 
     def collect() -> None:
         while not over.is_set():
-            removed.extend(item.key for item in apply_policy(store, Policy(older_than_s=3600.0, max_bytes=0)))
+            removed.extend(
+                item.key for item in apply_policy(store, Policy(older_than_s=3600.0, max_bytes=0)).removed
+            )
             store.gc()
 
     beside = threading.Thread(target=collect)

@@ -55,6 +55,13 @@ def test_a_path_has_one_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
             names(twice)
 
 
+def test_a_sequence_of_the_catalogue_has_one_name() -> None:
+    assert names(["phantom/1"]) == ["phantom/1@sparse"]
+    assert names(["phantom/1", "phantom/[0-1]@sparse"]) == ["phantom/1@sparse", "phantom/0@sparse"]
+    with pytest.raises(ConfigError, match="named twice"):
+        names(["phantom/1", "phantom/1@sparse"])
+
+
 def test_a_text_has_one_a_line(tmp_path: Path) -> None:
     file = manifest(tmp_path, "night.txt", TEXT)
     assert names([file]) == ["phantom/0@sparse", "phantom/1@sparse", "phantom/1@distanced"]

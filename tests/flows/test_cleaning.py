@@ -1,0 +1,93 @@
+"""Cleaning goes on where one step fails, and says so at the end; its numbers have bounds."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from prefect.exceptions import ParameterTypeError
+
+import flows.retention
+from extrags.errors import StoreError
+from extrags.store import Store
+from extrags.store.directory import DirectoryBackend
+from flows.cleaning import clean_store
+from flows.cli import main
+from flows.retention import retention
+
+
+@pytest.fixture
+def store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Store:
+    """Three old artefacts: one that goes, one that cannot be removed, one whose manifest is damaged."""
+    found = Store(tmp_path / "store")
+    for name in ("goes", "stays", "damaged"):
+        with found.slot(stage=name, version=1, key=f"{name}-v1-0", label=name) as slot:
+            (slot.path / "file").write_text("x")
+    (tmp_path / "store" / "artefacts" / "damaged-v1-0" / "manifest.json").write_text("{")
+    for name in ("goes", "stays", "damaged"):
+        os.utime(tmp_path / "store" / "artefacts" / f"{name}-v1-0", (time.time() - 90 * 86400,) * 2)
+    usual = DirectoryBackend.discard
+
+    def discard(backend: DirectoryBackend, key: str) -> bool:
+        if key == "stays-v1-0":
+            raise StoreError(f"{key} cannot be removed: Permission denied")
+        return usual(backend, key)
+
+    monkeypatch.setattr(DirectoryBackend, "discard", discard)
+    return found
+
+
+def test_the_flow_says_at_the_end_what_could_not_be_done(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[str] = []
+    pruned: list[object] = []
+    monkeypatch.setattr(flows.retention, "create_markdown_artifact", lambda text, **_: told.append(text))
+    monkeypatch.setattr(flows.retention, "prune_flow_runs", lambda *_, **__: pruned.append(_) or 3)
+    with pytest.raises(StoreError, match="not all could be cleaned: stays-v1-0 cannot be removed"):
+        retention.fn(store=store.root, older_than_days=30, flow_runs_days=30)
+    assert store.keys() == ["damaged-v1-0", "stays-v1-0"]
+    assert len(pruned) == 1
+    for row in ("| artefacts | 1 |", "| flow_runs | 3 |", "| skipped | 1 |"):
+        assert row in told[0]
+
+
+def test_leftovers_that_cannot_be_removed_keep_no_artefact(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def gc(_: Store, **__: object) -> list[str]:
+        raise PermissionError(13, "Permission denied", "failed/coarse")
+
+    monkeypatch.setattr(Store, "gc", gc)
+    policy: Any = flows.retention.Policy(older_than_s=86400.0)
+    done = clean_store(store, policy)
+    assert [item.key for item in done.artefacts.removed] == ["goes-v1-0"]
+    assert list(map(str, done.problems)) == [
+        "failed/coarse: Permission denied",
+        "stays-v1-0 cannot be removed: Permission denied",
+    ]
+    with pytest.raises(StoreError, match=r"failed/coarse: Permission denied \(and 1 more\)"):
+        done.check()
+
+
+@pytest.mark.usefixtures("untouched_environment")
+def test_the_command_says_so_as_well(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["cache", "gc", "--older-than", "30d", "--store", store.root]) == 1
+    said = capsys.readouterr()
+    assert "1 artefact of 1 B removed\n1 artefact skipped, whose manifests cannot be read" in said.out
+    assert "stays-v1-0 cannot be removed" in said.err
+
+
+@pytest.mark.parametrize("name", ["older_than_days", "max_gib", "flow_runs_days"])
+@pytest.mark.parametrize("value", [float("inf"), float("nan"), 1e308])
+def test_numbers_without_bounds_are_refused(name: str, value: float) -> None:
+    with pytest.raises(ParameterTypeError, match=f"{name}: Input should be"):
+        retention.validate_parameters({"store": "somewhere", name: value})
+
+
+@pytest.mark.usefixtures("untouched_environment")
+def test_a_size_beyond_all_bounds_is_refused(store: Store) -> None:
+    assert main(["cache", "gc", "--max-size", f"{'9' * 400}GiB", "--store", store.root]) == 2
