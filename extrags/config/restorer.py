@@ -16,9 +16,11 @@ __all__ = [
     "IouSet",
     "PretrainedConfig",
     "ReferenceChoice",
+    "SeamlessCloning",
 ]
 
 ReferenceChoice = Literal["covisibility", "nearest"]
+SeamlessCloning = Literal["auto", "always", "never"]
 """Which real view is the reference of a virtual one."""
 
 IouSet = Literal["reference", "union"]
@@ -157,6 +159,12 @@ class EnhanceConfig(StageConfig):
         True,
         description="compare the embedded restorer with blending and filling on leave-out pairs of the "
         "scene, and use the latter where the former is worse",
+    )
+    seamless_cloning: SeamlessCloning = Field(
+        "auto",
+        description="clone what the embedded restorer invents seamlessly into what is known, which then "
+        "keeps its colours. auto: where the judge finds the plain restorer worse than blending and filling, "
+        "and unjudged on scenes unlike those that it was trained on",
     )
     judge_pairs: int = Field(
         48,

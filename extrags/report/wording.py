@@ -65,7 +65,8 @@ def restorer_words(provenance: Mapping[str, Any]) -> str:
     """What restored the virtual views, and how it did on left-out frames; empty where nothing is known.
 
     Args:
-        provenance: of the restored views; `judged` is `{restored_db, filled_db, error_over_expected}`.
+        provenance: of the restored views; `judged` is `{restored_db, filled_db, error_over_expected}`, and
+            has `plain_db` where the restorer only serves by cloning seamlessly.
     """
     if "backend" not in provenance:
         return ""
@@ -85,6 +86,9 @@ def _judged_words(provenance: Mapping[str, Any]) -> str:
     trained_on = provenance.get("trained_on")
     said = f"Restored by {provenance['backend']}{f', weights for {trained_on}' if trained_on else ''}."
     judged = provenance.get("judged")
+    if provenance.get("seamless"):
+        said += " What it invents is cloned seamlessly into what is known, which keeps its colours"
+        said += f": {provenance['unjudged']}." if provenance.get("unjudged") else "."
     if not judged:
         if provenance["backend"] == "classical" and provenance.get("reason"):
             return f"Restored by blending and filling: {provenance['reason']}."
@@ -96,8 +100,10 @@ def _judged_words(provenance: Mapping[str, Any]) -> str:
             "Restored by blending and filling. The network was left out: on left-out frames of this scene "
             f"it reaches {restored} dB, {loss} dB less than blending and filling with {filled} dB."
         )
+    plain = judged.get("plain_db")
     said += (
         f" On left-out frames of this scene the network reaches {restored} dB, "
+        f"{'' if plain is None else f'without cloning {number(plain, 2)} dB, '}"
         f"blending and filling {filled} dB."
     )
     ratio = judged.get("error_over_expected")

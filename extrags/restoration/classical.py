@@ -46,6 +46,7 @@ class ClassicalEnhancer:
 
     name = "classical"
     follows_keyframes = True
+    keeps_known = True
 
     def restore(self, clip: Clip) -> Restoration:
         """Restore all views of a clip."""

@@ -18,7 +18,16 @@ from extrags.sequence import EndoscopicSequence
 from extrags.view_synthesis.conditioning import Layers
 from extrags.view_synthesis.references import LightTransfer
 
-__all__ = ["Backend", "Clip", "Enhancer", "Restoration", "never_trained_on", "restore_clip", "restore_clips"]
+__all__ = [
+    "Backend",
+    "Clip",
+    "Enhancer",
+    "Restoration",
+    "keeps_known",
+    "never_trained_on",
+    "restore_clip",
+    "restore_clips",
+]
 
 COLOR_ROUNDING = 1e-4
 """By so much colours may lie outside [0, 1]: half precision, and interpolation, round."""
@@ -87,6 +96,8 @@ class Enhancer(Protocol):
     (`Layers.get("invented")`, folded into the base image of `condition`) says so by a further attribute
     `follows_keyframes = True`; without it there are no keyframes. One that was trained on frames of the scene
     keeps what it was before as `untrained`: trials on left-out frames restore with that (`never_trained_on`).
+    One whose views are the base image of `condition` wherever that is certain says `keeps_known = True`:
+    held-out views then stay as the scene renders them there, and no network refines them.
     """
 
     @property
@@ -103,6 +114,11 @@ class Enhancer(Protocol):
         `extrags.restoration.description.write_description`.
         """
         ...
+
+
+def keeps_known(enhancer: Enhancer) -> bool:
+    """Whether restored views are the base image wherever that is certain; see `Enhancer`."""
+    return bool(getattr(enhancer, "keeps_known", False))
 
 
 def never_trained_on(enhancer: Enhancer) -> Enhancer:

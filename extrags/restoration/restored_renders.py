@@ -36,7 +36,7 @@ from extrags.restoration.agreement import agreed_views, feathered_invented_share
 from extrags.restoration.benchmark.evaluation import iterate_held_out_clips
 from extrags.restoration.classical import ClassicalEnhancer
 from extrags.restoration.diffusion.precision import chosen_precision
-from extrags.restoration.protocol import Clip, Enhancer, restore_clip
+from extrags.restoration.protocol import Clip, Enhancer, keeps_known, restore_clip
 from extrags.restoration.refinement.refiner import textured_views
 from extrags.restoration.refinement.weights import bundled_refiner
 from extrags.restoration.surface_texture import SurfaceTexture
@@ -110,9 +110,10 @@ def restored_renders(
 ) -> RenderedViews:
     """Restore rendered held-out views.
 
-    Where the restorer only blends and fills (`classical`, which also stands in for one that the leave-out
-    frames speak against), what the scene knows stays as it is rendered, views do not follow their neighbours,
-    and no network refines: what one invents is wrong there. Views are restored at `enhance.max_width` at
+    Where the restorer keeps what is known (`keeps_known`: `classical`, and one that clones seamlessly, which
+    stand in where the leave-out frames speak against a network), what the scene knows stays as it is
+    rendered, and no network refines: that, too, does harm there. Views that are only blended and filled do
+    not follow their neighbours either. Views are restored at `enhance.max_width` at
     most, as virtual views are.
 
     Args:
@@ -123,7 +124,7 @@ def restored_renders(
         enhancer: the scene's restorer.
         config: the number of references, the working width, the seed, and the refiner's precision.
         finish: what is done to invented colours: `textured` lays texture of the scene's own frames onto them,
-            `refined` gives both to the refiner of the package, unless the restorer only blends and fills.
+            `refined` gives both to the refiner of the package, unless the restorer keeps what is known.
         shares: how much of the restored views to take, from `restored_shares`; None takes `RESTORED_SHARE`.
 
     Returns:
@@ -145,13 +146,13 @@ def restored_renders(
     small, training = sequence.at_most_width(width), training.at_most_width(width)
     references = gather_references(coarse, training, training.train)
     texture = None if finish == "smooth" else SurfaceTexture.of_references(references, seed=config.seed)
-    refiner, keeps_known = None, isinstance(enhancer, ClassicalEnhancer)
-    if keeps_known:
+    refiner, keeping = None, keeps_known(enhancer)
+    if keeping:
         shares = RestoredShares(known=0.0)
     elif shares != RestoredShares():
         logger.info("restored views: %s", shares)
-    if finish == "refined" and keeps_known:
-        logger.info("restored views are not refined: the restorer only blends and fills")
+    if finish == "refined" and keeping:
+        logger.info("restored views are not refined: the restorer keeps what is known, as on unlike scenes")
     elif finish == "refined":
         refiner = bundled_refiner(half_precision=chosen_precision(config) == "bfloat16")
     if finish != "smooth" and texture is None:
@@ -163,7 +164,7 @@ def restored_renders(
         cameras = sequence.cameras[sequence.test[part]]
         view = _RestoredClip.of_clip(clip, _part_of(renders, part), enhancer)
         mixed, to_invent = view.mixed(shares), view.still_to_invent(shares)
-        if not keeps_known:
+        if not isinstance(enhancer, ClassicalEnhancer):
             mixed = mixed + view.agreement(mixed, to_invent)
         if texture is not None:
             full_size_depth_mm, invented = (
@@ -204,9 +205,9 @@ def restored_shares(
             the errors of their views are taken.
 
     Returns:
-        The shares; None where the restorer only blends and fills, which leaves known pixels alone anyway.
+        The shares; None where the restorer leaves known pixels alone anyway.
     """
-    if isinstance(enhancer, ClassicalEnhancer):
+    if keeps_known(enhancer):
         return None
     known, invented = _Errors(), _Errors()
     for coarse, renders, sequence in trials:

@@ -116,13 +116,16 @@ def _deterministic(
     return train_on_scene(pairs, transfer, _learning(config), deterministic=True)
 
 
+PLAIN: dict[str, Any] = {"judge": False, "seamless_cloning": "never"}
+
 RECIPES: dict[str, Recipe] = {
     "none": _unrestored,
     # Without `judge`: the restorer itself, also where the classical one would replace it.
-    "unreplaced": _of_backend("embedded", judge=False),
-    "scene-trained": _of_backend("embedded", learning=True, judge=False),
-    "scratch": _of_backend("embedded", learning=True, judge=False, pretrained_weights="none"),
-    "zero-shot": _of_backend("embedded", judge=False, train_iterations=0),
+    "unreplaced": _of_backend("embedded", **PLAIN),
+    "scene-trained": _of_backend("embedded", learning=True, **PLAIN),
+    "scratch": _of_backend("embedded", learning=True, **PLAIN, pretrained_weights="none"),
+    "zero-shot": _of_backend("embedded", **PLAIN, train_iterations=0),
+    "seamless": _of_backend("embedded", judge=False, seamless_cloning="always", train_iterations=0),
     "deterministic": _deterministic,
 }
 """How a restorer is made for a scene, beside the backends as they are."""

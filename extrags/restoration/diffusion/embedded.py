@@ -24,6 +24,7 @@ from extrags.restoration.diffusion.frame_features import sequence_features
 from extrags.restoration.diffusion.network import RestorationNetwork, build_network
 from extrags.restoration.diffusion.precision import chosen_precision
 from extrags.restoration.diffusion.rectified_flow import Sampled, sample
+from extrags.restoration.diffusion.seamless_cloning import certainty, cloned_seamlessly
 from extrags.restoration.diffusion.texture_transfer import PatchFeatures
 from extrags.restoration.diffusion.weights import WEIGHTS, find_weights
 from extrags.restoration.protocol import Clip, Restoration
@@ -46,14 +47,16 @@ from extrags.view_synthesis.references import LightTransfer
 
 __all__ = ["EmbeddedEnhancer", "pretrained"]
 
-FORMAT = 6
+FORMAT = 7
 """Raised when a saved restorer cannot be read by newer code."""
 _UNKNOWN_DOMAIN: dict[str, Any] = {"domain": None, "domain_score": None, "scene_calibrated": False}
+_PLAIN: dict[str, Any] = {"trained_on": "", "seamless": False}
 EARLIER_FORMATS: dict[int, dict[str, Any]] = {
-    2: {"generative": False, "drawing": False, "depth_from_image": None, "trained_on": ""},
-    3: {"depth_from_image": None, "trained_on": ""},
-    4: {"trained_on": ""},
-    5: {"trained_on": ""},
+    2: {"generative": False, "drawing": False, "depth_from_image": None, **_PLAIN},
+    3: {"depth_from_image": None, **_PLAIN},
+    4: _PLAIN,
+    5: _PLAIN,
+    6: {"seamless": False},
 }
 """What earlier formats that can be read lack, and what stands for it."""
 FIRST_DOMAIN_FORMAT = 5
@@ -98,6 +101,8 @@ class EmbeddedEnhancer:
         untrained: what the restorer was before it was trained on the scene; None where it was not, or began
             with nothing.
         trained_on: kind of scene that its weights have learned from, for reports; empty if unknown.
+        seamless: what it invents is cloned seamlessly into the base image, which stays where it is certain:
+            for scenes on which the network does harm where all is known.
     """
 
     network: RestorationNetwork
@@ -118,6 +123,7 @@ class EmbeddedEnhancer:
     scene_calibrated: bool = False
     untrained: EmbeddedEnhancer | None = None
     trained_on: str = ""
+    seamless: bool = False
 
     name = "embedded"
     follows_keyframes = True
@@ -146,6 +152,16 @@ class EmbeddedEnhancer:
             patches=patches if generative else None,
             depth_from_image=config.depth_from_image,
         )
+
+    @property
+    def keeps_known(self) -> bool:
+        """Whether restored views are the base image wherever that is certain."""
+        return self.seamless
+
+    def cloning_seamlessly(self) -> EmbeddedEnhancer:
+        """The same restorer, and what it was before it was trained on the scene, with `seamless` set."""
+        untrained = None if self.untrained is None else self.untrained.cloning_seamlessly()
+        return replace(self, seamless=True, untrained=untrained)
 
     def candidate_steps(self, config: EnhanceConfig) -> tuple[int, ...]:
         """Numbers of steps to choose from."""
@@ -225,6 +241,8 @@ class EmbeddedEnhancer:
                 patches=None if features is None else features.expanded(len(start)),
             )
             rgb = self.gamut.bounded(restored.rgb)
+            if self.seamless:
+                rgb = cloned_seamlessly(rgb, conditioning.base, certainty(group))
             error = self.error_model.applied(error_features(group, rgb, restored.error))
             return replace(restored, rgb=rgb, error=error)
 
@@ -287,10 +305,12 @@ class EmbeddedEnhancer:
             "drawing": self.drawing,
             "depth_from_image": self.depth_from_image,
             "trained_on": self.trained_on,
+            "seamless": self.seamless,
             "domain_score": self.domain_score,
             "validation": self.record.get("validation", {}),
             "scene_training_kept": self.record.get("scene_training_kept"),
             "judged": self.record.get("judged"),
+            "unjudged": self.record.get("unjudged"),
         }
 
     def save(self, path: Path, *, half: bool = False) -> None:
@@ -332,6 +352,7 @@ class EmbeddedEnhancer:
             "domain_score": self.domain_score,
             "scene_calibrated": self.scene_calibrated,
             "trained_on": self.trained_on,
+            "seamless": self.seamless,
             "record": self.record,
         }
         write_description(path, description)
@@ -393,6 +414,7 @@ class EmbeddedEnhancer:
                 bool(description["scene_calibrated"]),
                 _read_untrained(weights_file.with_name(UNTRAINED)),
                 str(description["trained_on"]),
+                bool(description["seamless"]),
             )
         try:
             network.load_state_dict(

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from extrags.config import CoarseConfig, EnhanceConfig
+from extrags.config import CoarseConfig, EnhanceConfig, SeamlessCloning
 from extrags.events import MetricRecorded, emit
 from extrags.restoration.classical import ClassicalEnhancer
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer, pretrained
@@ -32,10 +32,12 @@ from extrags.view_synthesis.gamut import Frame, Gamut
 from extrags.view_synthesis.gather import gather_references
 from extrags.view_synthesis.references import LightTransfer
 
-__all__ = ["best_of_all", "by_domain", "familiar", "scene_restorer"]
+__all__ = ["best_of_all", "familiar", "scene_restorer"]
 
 MAX_LOSS_DB = 0.5
 """A PSNR lower by up to so much is accepted: leave-out views are near the path, with little to restore."""
+MAX_LOSS_OUTSIDE_DB = 0.2
+"""The same outside of what the restorer knows: that it does better far from the path is less likely there."""
 
 logger = logging.getLogger(__name__)
 
@@ -59,25 +61,29 @@ def scene_restorer(
         _tell_domain(start)
     if start is not None and config.train_iterations == 0:
         gamut = _scene_gamut(sequence)
-        untouched = [restorer.with_settings(config, gamut, patches) for restorer in known]
+        untouched = [_as_asked(restorer.with_settings(config, gamut, patches), config) for restorer in known]
         if not config.judge:
-            return untouched[0]
+            return _cloning_outside(untouched[0], "enhance.judge is off", config.seamless_cloning)
         if len(sequence.train) < MIN_FRAMES:
-            return by_domain(
-                untouched[0], f"{len(sequence.train)} training frames are too few to leave some out"
-            )
+            few = f"{len(sequence.train)} training frames are too few to leave some out"
+            logger.warning("the restorer is not judged: %s", few)
+            return _cloning_outside(untouched[0], few, config.seamless_cloning)
         # Nothing is trained, so all leave-out pairs validate; synthetic ones would favour filling holes.
         leave_out = config.model_copy(update={"synthetic_views": 0})
         fresh = make_pairs(scene, sequence, leave_out, coarse, most=config.judge_pairs)
         pairs = replace(fresh, validation=np.ones(len(fresh), dtype=bool))
         # How far off it is differs more from scene to scene than where.
-        return best_of_all(untouched, pairs, transfer, calibrate=True)
+        return best_of_all(untouched, pairs, transfer, calibrate=True, cloning=config.seamless_cloning)
     pairs = make_pairs(scene, sequence, config, coarse)
-    trained = train_on_scene(pairs, transfer, config, start, patches=patches)
+    trained = _as_asked(train_on_scene(pairs, transfer, config, start, patches=patches), config)
     if not config.judge:
         return trained
     weights = Calibration() if start is None else start.calibration
-    return best_of_all([trained], pairs, transfer, of_weights=weights)
+    return best_of_all([trained], pairs, transfer, of_weights=weights, cloning=config.seamless_cloning)
+
+
+def _as_asked(restorer: EmbeddedEnhancer, config: EnhanceConfig) -> EmbeddedEnhancer:
+    return restorer.cloning_seamlessly() if config.seamless_cloning == "always" else restorer
 
 
 def familiar(restorers: Sequence[EmbeddedEnhancer]) -> list[EmbeddedEnhancer]:
@@ -102,11 +108,13 @@ def best_of_all(
     *,
     calibrate: bool = False,
     of_weights: Calibration | None = None,
+    cloning: SeamlessCloning = "auto",
 ) -> Enhancer:
-    """The best restorer, or the classical one where that is clearly better on the scene's validation pairs.
+    """The best restorer, as far as the scene's validation pairs do not prefer the classical one.
 
-    On scenes unlike its training data a network can do harm; the classical restorer then replaces it, and
-    carries the reason.
+    On scenes unlike its training data a network can do harm, mostly by a shift of colours. Then what it
+    invents is cloned seamlessly into what is known; where that, too, is clearly worse, the classical restorer
+    replaces it, and carries the reason.
 
     Args:
         restorers: ready for the scene, at least one; where no pair has a valid pixel the first counts.
@@ -115,17 +123,26 @@ def best_of_all(
         calibrate: fit the expected error of the restorer that is kept to these pairs.
         of_weights: calibration of the weights it began with, where its own has been fitted to these pairs,
             by which no error can be larger than expected.
+        cloning: `auto` tries seamless cloning where the restorers do harm as they are.
 
     Returns:
-        The restorer of the highest PSNR, with its scores, or the classical one with the reason.
+        The restorer of the highest PSNR, with its scores, plain or else seamless; or the classical one with
+        the reason.
     """
     chosen = validation_pairs(pairs)
     if not bool((pairs.weight > 0).any()):
-        return by_domain(restorers[0], "no left-out frame has a valid pixel")
-    trials = [_Trial.of(restorer, chosen or pairs, transfer) for restorer in restorers]
-    best = max(trials, key=lambda trial: trial.restored_db)
-    enhancer, means, scores = best.restorer, best.means, best.scores
-    restored, filled = best.restored_db, scores["classical"]["psnr"]
+        blind = "no left-out frame has a valid pixel"
+        logger.warning("the restorer is not judged: %s", blind)
+        return _cloning_outside(restorers[0], blind, cloning)
+    validating = chosen or pairs
+    best = _best(restorers, validating, transfer)
+    filled = best.scores["classical"]["psnr"]
+    score = best.restorer.domain_score
+    tolerated = MAX_LOSS_DB if score is None or score <= 1 else MAX_LOSS_OUTSIDE_DB
+    plain = best
+    if best.restored_db < filled - tolerated and cloning == "auto":
+        best = _best([each.cloning_seamlessly() for each in restorers], validating, transfer)
+    enhancer, means, restored = best.restorer, best.means, best.restored_db
     emit(MetricRecorded("enhance", "judged_gain_over_classical_db", restored - filled))
     shown = restored_pairs(enhancer, means.pairs, transfer) if enhancer.drawing else means
     # Without validation pairs nothing tells of errors: the restorer was trained on these.
@@ -138,17 +155,24 @@ def best_of_all(
         "filled_db": round(filled, 3),
         "error_over_expected": None if ratio is None else round(ratio, 3),
     }
-    score = enhancer.domain_score
-    # Outside of what it knows, nothing says that it does better far from the path than near it.
-    tolerated = MAX_LOSS_DB if score is None or score <= 1 else 0.0
+    if best is not plain:
+        judged["plain_db"] = round(plain.restored_db, 3)
     if restored < filled - tolerated:
         reason = (
             f"on leave-out pairs of this scene the embedded restorer reaches {restored:.2f} dB, blending and "
             f"filling {filled:.2f} dB"
         )
         logger.warning("%s; the scene is restored by blending and filling", reason)
-        return ClassicalEnhancer(reason, judged, score)
-    validation = {**enhancer.record.get("validation", {}), **scores}
+        return ClassicalEnhancer(reason, judged, enhancer.domain_score)
+    if best is not plain:
+        logger.warning(
+            "on leave-out pairs of this scene the embedded restorer reaches %.2f dB, blending and filling "
+            "%.2f dB: what it invents is cloned seamlessly into what is known, which reaches %.2f dB",
+            plain.restored_db,
+            filled,
+            restored,
+        )
+    validation = {**enhancer.record.get("validation", {}), **best.scores}
     kept = replace(enhancer, record={**enhancer.record, "validation": validation, "judged": judged})
     return with_calibration(kept, shown) if calibrate and chosen is not None else kept
 
@@ -172,23 +196,29 @@ class _Trial:
         return self.scores[self.means.name]["psnr"]
 
 
-def by_domain(enhancer: EmbeddedEnhancer, unjudged: str) -> Enhancer:
-    """The restorer where nothing can be left out to judge it, or the classical one on an unfamiliar scene.
+def _best(restorers: Sequence[EmbeddedEnhancer], pairs: Pairs, transfer: LightTransfer) -> _Trial:
+    trials = [_Trial.of(restorer, pairs, transfer) for restorer in restorers]
+    return max(trials, key=lambda trial: trial.restored_db)
+
+
+def _cloning_outside(enhancer: EmbeddedEnhancer, reason: str, cloning: SeamlessCloning) -> EmbeddedEnhancer:
+    """The restorer where nothing judges it: `auto` makes it clone seamlessly on an unfamiliar scene.
 
     Args:
         enhancer: ready for the scene.
-        unjudged: why it is not judged, for the log and the artefact.
+        reason: why it is not judged, for the log and the artefact.
+        cloning: as in the settings.
     """
     score = enhancer.domain_score
-    if score is None or score <= 1:
-        logger.warning("the restorer is not judged: %s", unjudged)
+    if cloning != "auto" or score is None or score <= 1:
         return enhancer
     reason = (
-        f"{unjudged}, and this scene is unlike what the embedded restorer was trained on ({score:.1f} times "
+        f"{reason}, and this scene is unlike what the embedded restorer was trained on ({score:.1f} times "
         "as far as unseen scenes of that kind are)"
     )
-    logger.warning("%s; the scene is restored by blending and filling", reason)
-    return ClassicalEnhancer(reason, None, score)
+    logger.warning("%s; what it invents is cloned seamlessly into what is known", reason)
+    found = enhancer.cloning_seamlessly()
+    return replace(found, record={**found.record, "unjudged": reason})
 
 
 def _tell_domain(enhancer: EmbeddedEnhancer) -> None:

@@ -154,6 +154,11 @@ def test_how_the_restorer_was_judged_is_told(inputs: ReportInputs, html: str) ->
             "Restored by embedded, weights for colons. On left-out",
         ),
         ({"backend": "classical", "reason": "why"}, "Restored by blending and filling: why."),
+        (
+            {"backend": "embedded", "judged": {**judged, "plain_db": 19.0}, "seamless": True},
+            "cloned seamlessly into what is known, which keeps its colours. On left-out frames of this scene "
+            "the network reaches 20.00 dB, without cloning 19.00 dB, blending and filling 26.00 dB.",
+        ),
     ):
         pseudo = replace(inputs.pseudo, provenance=provenance)
         html = build_report(replace(inputs, pseudo=pseudo), ReportConfig())

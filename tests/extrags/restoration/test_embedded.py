@@ -192,7 +192,7 @@ class TestEmbedded:
         assert validation_pairs(hidden) is None
         assert best_of_all([trained], hidden, tube.references.transfer) is trained
 
-    def test_unjudged_it_serves_familiar_scenes_alone(
+    def test_unjudged_it_serves_familiar_scenes_as_it_is(
         self, trained: EmbeddedEnhancer, tube_pairs: Pairs, tube: Tube, clip: Clip, tmp_path, caplog
     ) -> None:
         transfer = tube.references.transfer
@@ -200,12 +200,14 @@ class TestEmbedded:
         familiar, strange = (replace(trained, domain_score=score) for score in (0.9, 2.5))
         assert best_of_all([familiar], hidden, transfer) is familiar
         served = best_of_all([strange], hidden, transfer)
-        assert isinstance(served, ClassicalEnhancer)
+        assert isinstance(served, EmbeddedEnhancer)
+        assert served.seamless
         assert "no left-out frame has a valid pixel" in caplog.text
         served.save(tmp_path)
         provenance = load_enhancer(tmp_path).restore(clip).provenance
-        assert "2.5 times as far" in provenance["reason"]
+        assert "2.5 times as far" in provenance["unjudged"]
         assert provenance["domain_score"] == 2.5
+        assert best_of_all([strange], hidden, transfer, cloning="never") is strange
 
     @pytest.mark.parametrize(
         ("scores", "expected"),
@@ -242,8 +244,10 @@ class TestEmbedded:
             assert isinstance(alone, EmbeddedEnhancer)
             assert kept.record["judged"] == alone.record["judged"]
 
-    @pytest.mark.parametrize(("lost_db", "score", "kept"), [(0.3, 0.9, True), (0.3, 1.1, False)])
-    def test_on_unfamiliar_scenes_no_loss_is_tolerated(
+    @pytest.mark.parametrize(
+        ("lost_db", "score", "kept"), [(0.3, 0.9, True), (0.1, 1.1, True), (0.3, 1.1, False)]
+    )
+    def test_on_unfamiliar_scenes_less_loss_is_tolerated(
         self,
         trained: EmbeddedEnhancer,
         tube_pairs: Pairs,
@@ -258,19 +262,26 @@ class TestEmbedded:
         served = best_of_all([replace(trained, domain_score=score)], tube_pairs, tube.references.transfer)
         assert isinstance(served, EmbeddedEnhancer) == kept
 
-    def test_with_too_few_frames_to_leave_out_unfamiliar_scenes_are_filled(
-        self, tube: Tube, tmp_path: Path, trained: EmbeddedEnhancer, monkeypatch
+    @pytest.mark.parametrize("judge", [True, False])
+    def test_unjudged_unfamiliar_scenes_keep_what_is_known(
+        self, tube: Tube, tmp_path: Path, trained: EmbeddedEnhancer, monkeypatch, judge: bool
     ) -> None:
+        """With too few frames to leave some out, or because nobody asks for it."""
         monkeypatch.setattr(scene_restorer, "MIN_FRAMES", len(tube.sequence.train) + 1)
         features = sequence_features(trained.network, tube.sequence)
-        settings = {"train_iterations": 0, "pretrained_weights": str(tmp_path), "judge": True}
-        for limit, kind in ((1e6, EmbeddedEnhancer), (1e-6, ClassicalEnhancer)):
+        settings = {"train_iterations": 0, "pretrained_weights": str(tmp_path), "judge": judge}
+        for limit, cloning, seamless in (
+            (1e6, "auto", False),
+            (1e-6, "auto", True),
+            (1e-6, "never", False),
+            (1e6, "always", True),
+        ):
             domain = replace(Domain.fitted(features, []), limit=limit)
             replace(trained, domain=domain).save(tmp_path)
-            served = train_enhancer(
-                tube.scene, tube.sequence, SMALL.model_copy(update=settings), CoarseConfig()
-            )
-            assert isinstance(served, kind)
+            config = SMALL.model_copy(update={**settings, "seamless_cloning": cloning})
+            served = train_enhancer(tube.scene, tube.sequence, config, CoarseConfig())
+            assert isinstance(served, EmbeddedEnhancer)
+            assert served.seamless == seamless
 
     def test_validation_pairs_have_valid_pixels(self, tube_pairs: Pairs) -> None:
         chosen = np.flatnonzero(tube_pairs.validation)
@@ -343,9 +354,10 @@ class TestEmbedded:
         judged: list[Pairs] = []
 
         def keep(
-            enhancers: list[EmbeddedEnhancer], pairs: Pairs, _: object, *, calibrate: bool
+            enhancers: list[EmbeddedEnhancer], pairs: Pairs, _: object, *, calibrate: bool, cloning: str
         ) -> EmbeddedEnhancer:
             assert calibrate
+            assert cloning == "auto"
             judged.append(pairs)
             return enhancers[0]
 

@@ -61,6 +61,12 @@ class Unnamed(AsRendered):
         return ClassicalEnhancer().restore(clip)
 
 
+class Keeping(Unnamed):
+    """Says that it keeps what is known, as one that clones seamlessly does."""
+
+    keeps_known = True
+
+
 class TestRestoredRenders:
     @pytest.mark.usefixtures("each_alone")
     def test_a_restorer_that_changes_nothing_leaves_the_mean_of_both_scenes(
@@ -324,6 +330,7 @@ def test_a_refiner_changes_only_what_is_invented(
     # Where the leave-out frames speak against networks, none of them invents anything.
     without = finished("refined", ClassicalEnhancer())
     assert np.array_equal(without, finished("textured", ClassicalEnhancer()))
+    assert np.array_equal(finished("refined", Keeping()), finished("textured", Keeping()))
     assert len(asked) == 1
 
 

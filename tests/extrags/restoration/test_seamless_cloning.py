@@ -1,0 +1,132 @@
+"""What is invented joins what is known without a seam; where a restorer does harm, it serves like that."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from extrags.restoration.backends import load_enhancer
+from extrags.restoration.classical import ClassicalEnhancer
+from extrags.restoration.clips import render_clips
+from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
+from extrags.restoration.diffusion.scene_restorer import best_of_all
+from extrags.restoration.diffusion.scene_training import train_on_scene
+from extrags.restoration.diffusion.seamless_cloning import certainty, cloned_seamlessly
+from extrags.restoration.protocol import Clip, keeps_known
+from extrags.restoration.training_data.pairs import Pairs
+from tests.extrags.lit_tube import Tube, tube_cameras
+from tests.extrags.restoration.conftest import SMALL
+
+SIZE = (24, 32)
+HOLE = (slice(None), slice(None), slice(6, 18), slice(8, 24))
+
+
+@pytest.fixture
+def certain() -> Tensor:
+    """All but a hole in the middle."""
+    found = torch.ones(1, 1, *SIZE)
+    found[HOLE] = 0
+    return found
+
+
+class TestCloning:
+    def test_a_shift_of_colours_goes_and_texture_stays(self, certain: Tensor) -> None:
+        base = torch.full((1, 3, *SIZE), 0.5)
+        texture = 0.05 * torch.randn(1, 3, *SIZE, generator=torch.Generator().manual_seed(0)) * (1 - certain)
+        shift = torch.tensor([0.1, -0.05, 0.02])[None, :, None, None]
+        found = cloned_seamlessly(base + texture + shift, base, certain)
+        torch.testing.assert_close(found, base + texture, atol=1e-6, rtol=0)
+
+    def test_what_is_certain_keeps_every_colour(self, certain: Tensor) -> None:
+        generator = torch.Generator().manual_seed(1)
+        rgb, base = (torch.rand(1, 3, *SIZE, generator=generator) for _ in range(2))
+        found = cloned_seamlessly(rgb, base, certain)
+        known = certain.expand_as(found) == 1
+        torch.testing.assert_close(found[known], base[known], atol=1e-6, rtol=0)
+        assert found.min() >= 0
+        assert found.max() <= 1
+        assert not torch.equal(found[HOLE], base[HOLE])
+
+    def test_a_slope_across_the_hole_is_followed(self, certain: Tensor) -> None:
+        """At the left border the network is too bright, at the right one too dark."""
+        base = torch.full((1, 3, *SIZE), 0.5)
+        slope = torch.linspace(0.1, -0.1, SIZE[1]).expand(1, 3, *SIZE)
+        found = cloned_seamlessly(base + slope, base, certain)
+        # Push-pull is smooth, not linear.
+        assert (found - base)[HOLE].abs().max() < 0.5 * slope[HOLE].abs().max()
+
+    def test_of_a_view_of_which_nothing_is_known_all_is_invented(self) -> None:
+        rgb = torch.rand(1, 3, *SIZE, generator=torch.Generator().manual_seed(2))
+        found = cloned_seamlessly(rgb, torch.full_like(rgb, 0.5), torch.zeros(1, 1, *SIZE))
+        torch.testing.assert_close(found, rgb)
+
+
+@pytest.fixture(scope="module")
+def trained(tube: Tube, tube_pairs: Pairs) -> EmbeddedEnhancer:
+    return train_on_scene(tube_pairs, tube.references.transfer, SMALL)
+
+
+@pytest.fixture(scope="module")
+def clip(tube: Tube) -> Clip:
+    return render_clips(tube.scene, tube.references, [tube_cameras(3, offset_mm=4.0)], count=4)[0]
+
+
+def shifting(trained: EmbeddedEnhancer) -> EmbeddedEnhancer:
+    """The same restorer, all of whose colours are off."""
+    network = copy.deepcopy(trained.network)
+    with torch.no_grad():
+        network.exit.bias += 0.6
+    return replace(trained, network=network)
+
+
+class TestRestorer:
+    def test_pixels_are_those_of_the_base_image_as_far_as_they_are_certain(
+        self, trained: EmbeddedEnhancer, clip: Clip
+    ) -> None:
+        cloning = shifting(trained).cloning_seamlessly()
+        assert keeps_known(cloning)
+        assert not keeps_known(trained)
+        found, base = cloning.restore(clip).rgb, ClassicalEnhancer().restore(clip).rgb
+        certain = certainty(clip.layers)[:, 0].numpy()
+        off = np.abs(found - base).max(axis=-1)
+        plain_off = np.abs(shifting(trained).restore(clip).rgb - base).max(axis=-1)
+        # From the membrane, which lies between the differences, each is as far as it is uncertain.
+        assert (off <= 2 * (1 - certain) * plain_off.max() + 1e-5).all()
+        assert off.mean() < 0.5 * plain_off.mean()
+        assert found.min() >= 0
+        assert found.max() <= 1
+
+    def test_on_disk_and_back(self, trained: EmbeddedEnhancer, clip: Clip, tmp_path) -> None:
+        cloning = replace(trained, untrained=trained).cloning_seamlessly()
+        assert cloning.untrained is not None
+        assert cloning.untrained.seamless
+        cloning.save(tmp_path)
+        loaded = load_enhancer(tmp_path)
+        assert isinstance(loaded, EmbeddedEnhancer)
+        assert loaded.seamless
+        assert loaded.untrained is not None
+        assert loaded.untrained.seamless
+        assert loaded.restore(clip).provenance["seamless"]
+        np.testing.assert_array_equal(loaded.restore(clip).rgb, cloning.restore(clip).rgb)
+
+    def test_the_judge_lets_it_serve_where_the_plain_one_does_harm(
+        self, trained: EmbeddedEnhancer, tube: Tube, tube_pairs: Pairs, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        harmful, transfer = shifting(trained), tube.references.transfer
+        served = best_of_all([harmful], tube_pairs, transfer)
+        assert isinstance(served, EmbeddedEnhancer)
+        assert served.seamless
+        assert "cloned seamlessly" in caplog.text
+        judged = served.record["judged"]
+        assert judged["plain_db"] < judged["filled_db"] - 0.5
+        assert judged["restored_db"] >= judged["filled_db"] - 0.5
+        assert isinstance(best_of_all([harmful], tube_pairs, transfer, cloning="never"), ClassicalEnhancer)
+        plain = best_of_all([trained], tube_pairs, transfer)
+        assert isinstance(plain, EmbeddedEnhancer)
+        assert not plain.seamless
+        assert "plain_db" not in plain.record["judged"]
