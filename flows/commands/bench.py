@@ -106,10 +106,10 @@ def _add_enhance(parser: Parser) -> None:
         default=["none", "classical", "embedded"],
         metavar="METHOD",
         help="none, classical, embedded (as the settings say), embedded-1, embedded-4 (steps), zero-shot "
-        "(pretrained weights alone), scene-trained (trained further on the scene), scratch (trained on the "
-        "scene alone), deterministic (the same as a plain regression), each also with /no-references, "
-        "/agreed, /textured, /refined, /keyframes or /no-keyframes behind it (default: none classical "
-        "embedded)",
+        "(pretrained weights alone), seamless (the same, cloning seamlessly), scene-trained (trained further "
+        "on the scene), scratch (trained on the scene alone), deterministic (the same as a plain "
+        "regression), each also with /no-references, /agreed, /textured, /refined, /keyframes or "
+        "/no-keyframes behind it (default: none classical embedded)",
     )
     add_profile(parser, "quick")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of all stages (default: 0)")

@@ -160,6 +160,7 @@ METHODS: dict[str, Method] = {
     "scene-trained": Method("scene-trained"),
     "scratch": Method("scratch"),
     "zero-shot": Method("zero-shot"),
+    "seamless": Method("seamless"),
     "deterministic": Method("deterministic"),
 }
 """Methods beside the backends as they are; every one also with a suffix, `/keyframes` for instance."""
