@@ -114,7 +114,8 @@ def best_of_all(
 
     On scenes unlike its training data a network can do harm, mostly by a shift of colours. Then what it
     invents is cloned seamlessly into what is known; where that, too, is clearly worse, the classical restorer
-    replaces it, and carries the reason.
+    replaces it, and carries the reason. Views are compared as they are used: with the rendering put back
+    where it is certain.
 
     Args:
         restorers: ready for the scene, at least one; where no pair has a valid pixel the first counts.
@@ -136,7 +137,7 @@ def best_of_all(
         return _cloning_outside(restorers[0], blind, cloning)
     validating = chosen or pairs
     best = _best(restorers, validating, transfer)
-    filled = best.scores["classical"]["psnr"]
+    filled = best.scores["classical"]["psnr_kept"]
     score = best.restorer.domain_score
     tolerated = MAX_LOSS_DB if score is None or score <= 1 else MAX_LOSS_OUTSIDE_DB
     plain = best
@@ -193,7 +194,8 @@ class _Trial:
 
     @property
     def restored_db(self) -> float:
-        return self.scores[self.means.name]["psnr"]
+        """As its views are used: with what is known put back."""
+        return self.scores[self.means.name]["psnr_kept"]
 
 
 def _best(restorers: Sequence[EmbeddedEnhancer], pairs: Pairs, transfer: LightTransfer) -> _Trial:

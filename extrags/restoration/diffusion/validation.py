@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from extrags.metrics.image import psnr_per_image, ssim_map
+from extrags.restoration.clips import as_images, as_planes, keep_known
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.diffusion.rectified_flow import Sampled
 from extrags.restoration.training_data.pairs import Pairs
@@ -75,8 +76,9 @@ def validation_scores(
         candidates: numbers of sampling steps.
 
     Returns:
-        Of `none` (the rendering), `classical` (blend and fill) and `embedded_N`: `{psnr, ssim}`, and
-        `psnr_hole` where a validation pair has pixels of alpha below one half.
+        Of `none` (the rendering), `classical` (blend and fill) and `embedded_N`: `{psnr, psnr_kept, ssim}`,
+        `psnr_kept` with the rendering put back where it is certain, as for the fine-tuning; and `psnr_hole`
+        where a validation pair has pixels of alpha below one half.
     """
     chosen = validation_pairs(pairs) or pairs
     return scores_of([restored_pairs(enhancer, chosen, transfer, steps) for steps in candidates], transfer)
@@ -106,14 +108,26 @@ def validation_pairs(pairs: Pairs) -> Pairs | None:
     return pairs.subset(chosen) if len(chosen) else None
 
 
+def _mean_psnr(
+    render: Float[Tensor, "n h w 3"], target: Float[Tensor, "n h w 3"], mask: Bool[Tensor, "n h w"]
+) -> float:
+    return float(np.mean([value for value in psnr_per_image(render, target, mask) if value is not None]))
+
+
+def _with_known(render: Float[Tensor, "n h w 3"], pairs: Pairs) -> Float[Tensor, "n h w 3"]:
+    rendered = as_images(pairs.layers.get("rendered").clamp(0, 1))
+    kept, _ = keep_known(rendered, render.numpy(), as_planes(pairs.layers.get("uncertainty")))
+    return torch.from_numpy(kept)
+
+
 def _score(image: Float[Tensor, "n 3 h w"], pairs: Pairs) -> dict[str, float]:
     render = image.permute(0, 2, 3, 1)
     target = pairs.target.permute(0, 2, 3, 1)
     mask = pairs.weight[:, 0] > 0
     hole = mask & (pairs.layers.get("alpha")[:, 0] < HOLE_ALPHA)
-    known = [value for value in psnr_per_image(render, target, mask) if value is not None]
     score = {
-        "psnr": float(np.mean(known)),
+        "psnr": _mean_psnr(render, target, mask),
+        "psnr_kept": _mean_psnr(_with_known(render, pairs), target, mask),
         "ssim": float(ssim_map(render, target, figures=False)[mask].mean()),
     }
     if bool(hole.any()):

@@ -257,7 +257,10 @@ class TestEmbedded:
         score: float,
         kept: bool,
     ) -> None:
-        scores = {f"embedded_{trained.steps}": {"psnr": 20.0}, "classical": {"psnr": 20.0 + lost_db}}
+        scores = {
+            f"embedded_{trained.steps}": {"psnr_kept": 20.0},
+            "classical": {"psnr_kept": 20.0 + lost_db},
+        }
         monkeypatch.setattr(scene_restorer, "scores_of", lambda *_: scores)
         served = best_of_all([replace(trained, domain_score=score)], tube_pairs, tube.references.transfer)
         assert isinstance(served, EmbeddedEnhancer) == kept
