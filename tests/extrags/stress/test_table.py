@@ -75,6 +75,7 @@ def test_quick_rows_pass() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1200)
 def test_all_rows_pass() -> None:
     failed = [row for row in run_rows(ROWS) if not row["passed"]]
     assert failed == []
