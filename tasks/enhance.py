@@ -51,6 +51,7 @@ _OF_EMBEDDED = frozenset(
         "references",
         "samples",
         "scene_learning_rate",
+        "seamless_cloning",
         "seed",
         "steps",
         "synthetic_views",

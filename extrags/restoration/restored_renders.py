@@ -34,7 +34,6 @@ from extrags.metrics.protocol import RenderedViews
 from extrags.radial_lens import WIDE_FIELD_DEG
 from extrags.restoration.agreement import agreed_views, feathered_invented_share
 from extrags.restoration.benchmark.evaluation import iterate_held_out_clips
-from extrags.restoration.classical import ClassicalEnhancer
 from extrags.restoration.diffusion.precision import chosen_precision
 from extrags.restoration.protocol import Clip, Enhancer, keeps_known, restore_clip
 from extrags.restoration.refinement.refiner import textured_views
@@ -112,8 +111,8 @@ def restored_renders(
 
     Where the restorer keeps what is known (`keeps_known`: `classical`, and one that clones seamlessly, which
     stand in where the leave-out frames speak against a network), what the scene knows stays as it is
-    rendered, and no network refines: that, too, does harm there. Views that are only blended and filled do
-    not follow their neighbours either. Views are restored at `enhance.max_width` at
+    rendered, views do not follow their neighbours, and no network refines: what one invents is wrong there.
+    Views are restored at `enhance.max_width` at
     most, as virtual views are.
 
     Args:
@@ -164,7 +163,7 @@ def restored_renders(
         cameras = sequence.cameras[sequence.test[part]]
         view = _RestoredClip.of_clip(clip, _part_of(renders, part), enhancer)
         mixed, to_invent = view.mixed(shares), view.still_to_invent(shares)
-        if not isinstance(enhancer, ClassicalEnhancer):
+        if not keeping:
             mixed = mixed + view.agreement(mixed, to_invent)
         if texture is not None:
             full_size_depth_mm, invented = (

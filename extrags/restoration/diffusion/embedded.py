@@ -159,9 +159,12 @@ class EmbeddedEnhancer:
         return self.seamless
 
     def cloning_seamlessly(self) -> EmbeddedEnhancer:
-        """The same restorer, and what it was before it was trained on the scene, with `seamless` set."""
+        """The same restorer, and what it was before it was trained on the scene, with `seamless` set.
+
+        Depth is not read from its images: their tissue is foreign to the reader as well.
+        """
         untrained = None if self.untrained is None else self.untrained.cloning_seamlessly()
-        return replace(self, seamless=True, untrained=untrained)
+        return replace(self, seamless=True, depth_from_image=False, untrained=untrained)
 
     def candidate_steps(self, config: EnhanceConfig) -> tuple[int, ...]:
         """Numbers of steps to choose from."""

@@ -36,8 +36,8 @@ __all__ = ["best_of_all", "familiar", "scene_restorer"]
 
 MAX_LOSS_DB = 0.5
 """A PSNR lower by up to so much is accepted: leave-out views are near the path, with little to restore."""
-MAX_LOSS_OUTSIDE_DB = 0.2
-"""The same outside of what the restorer knows: that it does better far from the path is less likely there."""
+MAX_LOSS_CLONING_DB = 0.1
+"""The same where it clones seamlessly: but for what it invents, views are those of blending and filling."""
 
 logger = logging.getLogger(__name__)
 
@@ -139,10 +139,12 @@ def best_of_all(
     best = _best(restorers, validating, transfer)
     filled = best.scores["classical"]["psnr_kept"]
     score = best.restorer.domain_score
-    tolerated = MAX_LOSS_DB if score is None or score <= 1 else MAX_LOSS_OUTSIDE_DB
+    # Outside of what it knows, nothing says that it does better far from the path than near it.
+    tolerated = MAX_LOSS_DB if score is None or score <= 1 else 0.0
     plain = best
     if best.restored_db < filled - tolerated and cloning == "auto":
         best = _best([each.cloning_seamlessly() for each in restorers], validating, transfer)
+        tolerated = MAX_LOSS_CLONING_DB
     enhancer, means, restored = best.restorer, best.means, best.restored_db
     emit(MetricRecorded("enhance", "judged_gain_over_classical_db", restored - filled))
     shown = restored_pairs(enhancer, means.pairs, transfer) if enhancer.drawing else means

@@ -245,9 +245,10 @@ class TestEmbedded:
             assert kept.record["judged"] == alone.record["judged"]
 
     @pytest.mark.parametrize(
-        ("lost_db", "score", "kept"), [(0.3, 0.9, True), (0.1, 1.1, True), (0.3, 1.1, False)]
+        ("lost_db", "score", "served_by"),
+        [(0.3, 0.9, "plain"), (0.05, 1.1, "seamless"), (0.3, 1.1, "filling"), (0.7, 0.9, "filling")],
     )
-    def test_on_unfamiliar_scenes_less_loss_is_tolerated(
+    def test_on_unfamiliar_scenes_no_loss_is_tolerated_but_of_cloning(
         self,
         trained: EmbeddedEnhancer,
         tube_pairs: Pairs,
@@ -255,7 +256,7 @@ class TestEmbedded:
         monkeypatch,
         lost_db: float,
         score: float,
-        kept: bool,
+        served_by: str,
     ) -> None:
         scores = {
             f"embedded_{trained.steps}": {"psnr_kept": 20.0},
@@ -263,7 +264,8 @@ class TestEmbedded:
         }
         monkeypatch.setattr(scene_restorer, "scores_of", lambda *_: scores)
         served = best_of_all([replace(trained, domain_score=score)], tube_pairs, tube.references.transfer)
-        assert isinstance(served, EmbeddedEnhancer) == kept
+        assert isinstance(served, EmbeddedEnhancer) == (served_by != "filling")
+        assert getattr(served, "seamless", False) == (served_by == "seamless")
 
     @pytest.mark.parametrize("judge", [True, False])
     def test_unjudged_unfamiliar_scenes_keep_what_is_known(
