@@ -20,8 +20,10 @@ __all__ = [
 ]
 
 ReferenceChoice = Literal["covisibility", "nearest"]
-SeamlessCloning = Literal["auto", "always", "never"]
 """Which real view is the reference of a virtual one."""
+
+SeamlessCloning = Literal["auto", "always", "never"]
+"""When what a restorer invents is cloned seamlessly into what is known."""
 
 IouSet = Literal["reference", "union"]
 """What the overlap of two views is a share of."""

@@ -112,8 +112,7 @@ def restored_renders(
     Where the restorer keeps what is known (`keeps_known`: `classical`, and one that clones seamlessly, which
     stand in where the leave-out frames speak against a network), what the scene knows stays as it is
     rendered, views do not follow their neighbours, and no network refines: what one invents is wrong there.
-    Views are restored at `enhance.max_width` at
-    most, as virtual views are.
+    Views are restored at `enhance.max_width` at most, as virtual views are.
 
     Args:
         coarse: the scene that the restorer was made for.
