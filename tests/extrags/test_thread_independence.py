@@ -67,7 +67,9 @@ class Stages:
         self.tube = build_tube(enlarged=ENLARGED)
         self.withheld = with_points(withheld_phantom(5)).training_part()
         with threads(1):
-            self.enhancer = self._restorer(ENHANCE.model_copy(update={"judge": False}))
+            # As it is, so that there is a share of restored views to judge.
+            plain = {"judge": False, "seamless_cloning": "never"}
+            self.enhancer = self._restorer(ENHANCE.model_copy(update=plain))
             self.pseudo_views = self._restored()
         self._expected: dict[str, Arrays] = {}
 
