@@ -166,7 +166,7 @@ class EnhanceConfig(StageConfig):
         "auto",
         description="clone what the embedded restorer invents seamlessly into what is known, which then "
         "keeps its colours. auto: where the judge finds the plain restorer worse than blending and filling, "
-        "and unjudged on scenes unlike those that it was trained on",
+        "and unjudged on scenes unlike all that it was trained on",
     )
     judge_pairs: int = Field(
         48,

@@ -13,6 +13,7 @@ import time
 import uuid
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -45,8 +46,8 @@ def names(removals: list[Removal]) -> list[str]:
     return [item.key.removesuffix("-v1-00") for item in removals]
 
 
-def planned(store: Store, **policy: object) -> list[str]:
-    return names(planned_removals(store, Policy(**policy)).removed)  # type: ignore[arg-type]
+def planned(store: Store, **policy: Any) -> list[str]:
+    return names(planned_removals(store, Policy(**policy)).removed)
 
 
 @pytest.fixture
@@ -313,8 +314,8 @@ def test_nothing_is_removed_that_a_run_has_begun_to_use_since(
 
     whole = retention._planned
 
-    def and_then_it_is_found(*given: object) -> object:
-        plan = whole(*given)  # type: ignore[arg-type]
+    def and_then_it_is_found(*given: Any) -> object:
+        plan = whole(*given)
         chain.find("coarse-v1-00")
         return plan
 

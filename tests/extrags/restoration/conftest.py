@@ -12,8 +12,12 @@ import pytest
 import torch
 
 from extrags.config import EnhanceConfig
+from extrags.restoration.clips import render_clips
+from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
+from extrags.restoration.diffusion.scene_training import train_on_scene
+from extrags.restoration.protocol import Clip
 from extrags.restoration.training_data.pairs import Pairs, synthetic_pairs
-from tests.extrags.lit_tube import Tube
+from tests.extrags.lit_tube import Tube, tube_cameras
 from tests.extrags.restoration.pretrained.tiny_pipelines import BUILDERS
 
 # Before huggingface_hub is loaded: nothing in these tests may reach for the network.
@@ -45,6 +49,18 @@ SMALL = EnhanceConfig(
 @pytest.fixture(scope="session")
 def tube_pairs(tube: Tube) -> Pairs:
     return synthetic_pairs(tube.scene, tube.sequence, SMALL)
+
+
+@pytest.fixture(scope="session")
+def trained(tube: Tube, tube_pairs: Pairs) -> EmbeddedEnhancer:
+    """A small restorer that has learned from the tube alone."""
+    return train_on_scene(tube_pairs, tube.references.transfer, SMALL)
+
+
+@pytest.fixture(scope="session")
+def clip(tube: Tube) -> Clip:
+    """Three views off the path."""
+    return render_clips(tube.scene, tube.references, [tube_cameras(3, offset_mm=4.0)], count=4)[0]
 
 
 @pytest.fixture(scope="session")

@@ -15,7 +15,6 @@ from extrags.depth.hidden import SOLID
 from extrags.errors import ConfigError, WeightsError
 from extrags.restoration.backends import load_enhancer, train_enhancer
 from extrags.restoration.classical import ClassicalEnhancer
-from extrags.restoration.clips import render_clips
 from extrags.restoration.diffusion import scene_restorer
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.diffusion.error_fit import cell_errors, error_over_expected
@@ -30,18 +29,8 @@ from extrags.restoration.uncertainty.calibration import Calibration
 from extrags.restoration.uncertainty.domain import Domain
 from extrags.thresholds import HOLE_ALPHA
 from extrags.view_synthesis.gamut import Gamut
-from tests.extrags.lit_tube import Tube, tube_cameras
+from tests.extrags.lit_tube import Tube
 from tests.extrags.restoration.conftest import SMALL
-
-
-@pytest.fixture(scope="module")
-def trained(tube: Tube, tube_pairs: Pairs) -> EmbeddedEnhancer:
-    return train_on_scene(tube_pairs, tube.references.transfer, SMALL)
-
-
-@pytest.fixture(scope="module")
-def clip(tube: Tube) -> Clip:
-    return render_clips(tube.scene, tube.references, [tube_cameras(3, offset_mm=4.0)], count=4)[0]
 
 
 class TestEmbedded:

@@ -12,15 +12,12 @@ from torch import Tensor
 
 from extrags.restoration.backends import load_enhancer
 from extrags.restoration.classical import ClassicalEnhancer
-from extrags.restoration.clips import render_clips
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.diffusion.scene_restorer import best_of_all
-from extrags.restoration.diffusion.scene_training import train_on_scene
 from extrags.restoration.diffusion.seamless_cloning import certainty, cloned_seamlessly
 from extrags.restoration.protocol import Clip, keeps_known
 from extrags.restoration.training_data.pairs import Pairs
-from tests.extrags.lit_tube import Tube, tube_cameras
-from tests.extrags.restoration.conftest import SMALL
+from tests.extrags.lit_tube import Tube
 
 SIZE = (24, 32)
 HOLE = (slice(None), slice(None), slice(6, 18), slice(8, 24))
@@ -64,16 +61,6 @@ class TestCloning:
         rgb = torch.rand(1, 3, *SIZE, generator=torch.Generator().manual_seed(2))
         found = cloned_seamlessly(rgb, torch.full_like(rgb, 0.5), torch.zeros(1, 1, *SIZE))
         torch.testing.assert_close(found, rgb)
-
-
-@pytest.fixture(scope="module")
-def trained(tube: Tube, tube_pairs: Pairs) -> EmbeddedEnhancer:
-    return train_on_scene(tube_pairs, tube.references.transfer, SMALL)
-
-
-@pytest.fixture(scope="module")
-def clip(tube: Tube) -> Clip:
-    return render_clips(tube.scene, tube.references, [tube_cameras(3, offset_mm=4.0)], count=4)[0]
 
 
 def shifting(trained: EmbeddedEnhancer) -> EmbeddedEnhancer:
