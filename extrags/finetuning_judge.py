@@ -26,7 +26,7 @@ from extrags.evaluation import render
 from extrags.events import MetricRecorded, Progress, emit
 from extrags.metrics.image import psnr_per_image
 from extrags.pseudo_views import PseudoViews
-from extrags.restoration.protocol import Enhancer, never_trained_on
+from extrags.restoration.protocol import Enhancer, among_kept, never_trained_on
 from extrags.restoration.restored_renders import RestoredShares, restored_shares
 from extrags.restoration.trajectories import restored_batches
 from extrags.scene import Scene
@@ -233,7 +233,9 @@ def judge_finetuning(
             (arm.start, render(final, arm.sequence), arm.sequence)
             for arm, final in zip(arms, scenes[judgement.amount], strict=True)
         )
-        shares = restored_shares(shown, enhancer, enhance, error_share=float(share))
+        shares = restored_shares(
+            shown, enhancer, enhance, error_share=float(share), kept=[arm.kept for arm in arms]
+        )
         judgement = replace(judgement, restored_shares=shares)
     logger.info("finetune: %s", judgement.reason)
     return judgement
@@ -246,6 +248,7 @@ class _Arm:
     Args:
         sequence: the frames, at the size of trials; those left out are held out.
         left_out: their positions among the training frames.
+        kept: the positions of the others.
         start: the brief reconstruction.
         views: its virtual views, restored; None without a restorer.
         frame_weights: of the frames it was made from; None where they count alike.
@@ -253,6 +256,7 @@ class _Arm:
 
     sequence: EndoscopicSequence
     left_out: Int[np.ndarray, "m"]
+    kept: Int[np.ndarray, "k"]
     start: Scene
     views: PseudoViews | None
     frame_weights: FrameWeights | None
@@ -273,6 +277,7 @@ def _arms(
     frames = np.asarray(sequence.train, dtype=np.int64)
     small = sequence.at_most_width(settings.max_width)
     for part, left_out in _without_some_frames(small, frames, settings.leave_out_every):
+        kept = np.flatnonzero(np.isin(frames, part.train))
         # Once for the brief reconstruction and all amounts.
         weighted = coarse.inconsistent_frames == "weight"
         weights = frame_weights(part, part.train) if weighted else None
@@ -289,8 +294,9 @@ def _arms(
         views = None
         if enhancer is not None:
             smaller = [cameras.at_most_width(settings.max_width) for cameras in trajectories]
-            views = _restored(start, part, smaller, enhancer, enhance, settings.views, measure)
-        yield _Arm(part, left_out, start, views, weights)
+            restorer = among_kept(enhancer, kept)
+            views = _restored(start, part, smaller, restorer, enhance, settings.views, measure)
+        yield _Arm(part, left_out, kept, start, views, weights)
 
 
 def _finetuned(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -23,6 +23,7 @@ __all__ = [
     "Clip",
     "Enhancer",
     "Restoration",
+    "among_kept",
     "keeps_known",
     "never_trained_on",
     "restore_clip",
@@ -132,6 +133,46 @@ def never_trained_on(enhancer: Enhancer) -> Enhancer:
     """
     untrained: Enhancer | None = getattr(enhancer, "untrained", None)
     return enhancer if untrained is None else untrained
+
+
+@dataclass(frozen=True)
+class _AmongKept:
+    """A restorer whose clips count their references among some of the frames that it was made from."""
+
+    enhancer: Enhancer
+    kept: Int[np.ndarray, "k"]
+
+    @property
+    def name(self) -> str:
+        return self.enhancer.name
+
+    @property
+    def follows_keyframes(self) -> bool:
+        return bool(getattr(self.enhancer, "follows_keyframes", False))
+
+    @property
+    def keeps_known(self) -> bool:
+        return keeps_known(self.enhancer)
+
+    def restore(self, clip: Clip) -> Restoration:
+        return self.enhancer.restore(replace(clip, reference=self.kept[clip.reference]))
+
+    def save(self, path: Path) -> None:
+        self.enhancer.save(path)
+
+
+def among_kept(enhancer: Enhancer, kept: Int[np.ndarray, "k"]) -> Enhancer:
+    """The restorer for a trial that leaves out some of the training frames it was made from.
+
+    A restorer that keeps real views of its own finds them by `Clip.reference`, which in a trial is a position
+    among the frames that are kept: taken for one among all of them, it would name another frame, and perhaps
+    one that is left out.
+
+    Args:
+        enhancer: of the scene.
+        kept: positions, among the training frames of the scene, of those of the trial.
+    """
+    return _AmongKept(enhancer, kept)
 
 
 @runtime_checkable

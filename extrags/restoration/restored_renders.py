@@ -12,6 +12,7 @@ docs/references.md; what is restored and mixed here differs.
 
 from __future__ import annotations
 
+import itertools
 import logging
 import math
 from collections.abc import Iterable
@@ -19,7 +20,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
@@ -35,7 +36,7 @@ from extrags.radial_lens import WIDE_FIELD_DEG
 from extrags.restoration.agreement import agreed_views, feathered_invented_share
 from extrags.restoration.benchmark.evaluation import iterate_held_out_clips
 from extrags.restoration.diffusion.precision import chosen_precision
-from extrags.restoration.protocol import Clip, Enhancer, keeps_known, restore_clip
+from extrags.restoration.protocol import Clip, Enhancer, among_kept, keeps_known, restore_clip
 from extrags.restoration.refinement.refiner import textured_views
 from extrags.restoration.refinement.weights import bundled_refiner
 from extrags.restoration.surface_texture import SurfaceTexture
@@ -183,6 +184,7 @@ def restored_shares(
     config: EnhanceConfig,
     *,
     error_share: float = 1.0,
+    kept: Iterable[Int[np.ndarray, "k"]] | None = None,
 ) -> RestoredShares | None:
     """How much of the restored views to take, as left-out frames tell.
 
@@ -201,6 +203,8 @@ def restored_shares(
         config: the number of references and the working width.
         error_share: squared error of the whole scene as a share of the trials', which are brief: of so much
             the errors of their views are taken.
+        kept: of each trial, the positions of its training frames among those that the restorer was made from;
+            None where they are the same.
 
     Returns:
         The shares; None where the restorer leaves known pixels alone anyway.
@@ -208,7 +212,8 @@ def restored_shares(
     if keeps_known(enhancer):
         return None
     known, invented = _Errors(), _Errors()
-    for coarse, renders, sequence in trials:
+    restorers = itertools.repeat(enhancer) if kept is None else (among_kept(enhancer, own) for own in kept)
+    for (coarse, renders, sequence), restorer in zip(trials, restorers, strict=False):
         if sequence.lens is not None:
             training, renders = sequence.as_pinhole(), _flattened(renders, sequence)[0]
             sequence = sequence.as_pinhole(WIDE_FIELD_DEG)
@@ -222,7 +227,7 @@ def restored_shares(
         for clip in clips:
             part = slice(done, done + len(clip))
             frames = sequence.test[part]
-            view = _RestoredClip.of_clip(clip, _part_of(renders, part), enhancer)
+            view = _RestoredClip.of_clip(clip, _part_of(renders, part), restorer)
             truth = torch.from_numpy(frames_of(sequence.rgb, frames)).permute(0, 3, 1, 2).float() / 255
             solid = view.solid * torch.from_numpy(frames_of(sequence.mask, frames))[:, None]
             mostly = view.invented > MOSTLY

@@ -123,13 +123,36 @@ def test_a_restorer_does_not_restore_frames_that_it_was_trained_on(tube: Tube) -
     assert judged(tube, Trained(""), config) == judged(tube, Destroyer(""), config)
 
 
+class Remembering(AsRendered):
+    """A restorer that has the training frames of the scene, and remembers which it was referred to."""
+
+    def __init__(self) -> None:
+        self.references: list[int] = []
+
+    def restore(self, clip: Clip) -> Restoration:
+        self.references += clip.reference.tolist()
+        return super().restore(clip)
+
+
+def test_a_restorer_is_referred_to_frames_that_are_kept(tube: Tube) -> None:
+    """In one trial alone, so that what it leaves out is left out of all of it."""
+    enhancer = Remembering()
+    judge = FINETUNE.judge.model_copy(update={"leave_out_every": 2})
+    config = FINETUNE.model_copy(update={"iterations": 5, "judge": judge})
+    found = judged(tube, enhancer, config)
+    kept = set(range(len(tube.sequence.train))) - set(found.left_out)
+    assert len(found.left_out) == 5
+    assert len(set(enhancer.references)) > 1
+    assert set(enhancer.references) <= kept
+
+
 def test_it_tells_how_much_of_restored_views_serves(tube: Tube, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a restorer that changes nothing: the trial's coarse scene against its fine-tuned one."""
     asked: list[float] = []
 
-    def keeping(*arguments: Any, error_share: float) -> RestoredShares | None:
+    def keeping(*arguments: Any, error_share: float, **others: Any) -> RestoredShares | None:
         asked.append(error_share)
-        return restored_shares(*arguments, error_share=error_share)
+        return restored_shares(*arguments, error_share=error_share, **others)
 
     monkeypatch.setattr(finetuning_judge, "restored_shares", keeping)
     config = FINETUNE.model_copy(update={"iterations": 300})
