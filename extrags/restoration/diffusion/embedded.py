@@ -67,6 +67,8 @@ UNTRAINED = "untrained"
 COLOR_STEPS = 255
 CHANNELS_OF_NETWORKS = (CONDITION_CHANNELS, CONDITION_CHANNELS + INVENTED_CHANNELS)
 """Without and with channels of their own for what keyframes have invented."""
+OF_A_SCENE = ("judged", "unjudged", "scene_training_kept")
+"""What a record holds of one scene alone."""
 MOST_MODESTY = 3.0
 CANDIDATE_STEPS = (1, 4)
 """More steps never gained on held-out pairs; which of these does differs from scene to scene."""
@@ -151,6 +153,22 @@ class EmbeddedEnhancer:
             drawing=generative and config.samples != "mean",
             patches=patches if generative else None,
             depth_from_image=config.depth_from_image,
+        )
+
+    def without_scene(self) -> EmbeddedEnhancer:
+        """The weights alone, for another scene to start from: what was found for a scene is forgotten.
+
+        A saved restorer serves as weights; how the scene that it was saved for was restored and judged says
+        nothing of the next one.
+        """
+        record = {name: value for name, value in self.record.items() if name not in OF_A_SCENE}
+        return replace(
+            self,
+            record=record,
+            domain_score=None,
+            scene_calibrated=False,
+            untrained=None,
+            seamless=False,
         )
 
     @property
@@ -468,4 +486,4 @@ def pretrained(config: EnhanceConfig) -> tuple[EmbeddedEnhancer, ...]:
         raise ConfigError(
             "enhance.train_iterations is 0 and enhance.pretrained_weights is none: nothing would restore"
         )
-    return tuple(map(EmbeddedEnhancer.load, weights))
+    return tuple(EmbeddedEnhancer.load(file).without_scene() for file in weights)

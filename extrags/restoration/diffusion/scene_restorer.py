@@ -38,6 +38,7 @@ MAX_LOSS_DB = 0.5
 """A PSNR lower by up to so much is accepted: leave-out views are near the path, with little to restore."""
 MAX_LOSS_CLONING_DB = 0.1
 """The same where it clones seamlessly: but for what it invents, views are those of blending and filling."""
+JUDGE_OFF = "enhance.judge is off"
 
 logger = logging.getLogger(__name__)
 
@@ -63,7 +64,7 @@ def scene_restorer(
         gamut = _scene_gamut(sequence)
         untouched = [_as_asked(restorer.with_settings(config, gamut, patches), config) for restorer in known]
         if not config.judge:
-            return _cloning_outside(untouched[0], "enhance.judge is off", config.seamless_cloning)
+            return _cloning_outside(untouched[0], JUDGE_OFF, config.seamless_cloning)
         if len(sequence.train) < MIN_FRAMES:
             few = f"{len(sequence.train)} training frames are too few to leave some out"
             logger.warning("the restorer is not judged: %s", few)
@@ -77,7 +78,10 @@ def scene_restorer(
     pairs = make_pairs(scene, sequence, config, coarse)
     trained = _as_asked(train_on_scene(pairs, transfer, config, start, patches=patches), config)
     if not config.judge:
-        return trained
+        if trained.record["scene_training_kept"] is False:
+            # What restores are weights that do not know this scene, as where none of them are trained.
+            trained = _cloning_outside(trained, JUDGE_OFF, config.seamless_cloning)
+        return _recalibrated(trained, pairs, transfer)
     weights = Calibration() if start is None else start.calibration
     return best_of_all([trained], pairs, transfer, of_weights=weights, cloning=config.seamless_cloning)
 
@@ -177,7 +181,21 @@ def best_of_all(
         )
     validation = {**enhancer.record.get("validation", {}), **best.scores}
     kept = replace(enhancer, record={**enhancer.record, "validation": validation, "judged": judged})
-    return with_calibration(kept, shown) if calibrate and chosen is not None else kept
+    fitted = calibrate or _calibrated_plain(kept)
+    return with_calibration(kept, shown) if fitted and chosen is not None else kept
+
+
+def _calibrated_plain(enhancer: EmbeddedEnhancer) -> bool:
+    """Whether it clones seamlessly by now, and its expected error was fitted to what it was before."""
+    return enhancer.seamless and enhancer.scene_calibrated
+
+
+def _recalibrated(enhancer: EmbeddedEnhancer, pairs: Pairs, transfer: LightTransfer) -> EmbeddedEnhancer:
+    """The restorer with the expected error of the views that it makes now."""
+    chosen = validation_pairs(pairs)
+    if chosen is None or not _calibrated_plain(enhancer):
+        return enhancer
+    return with_calibration(enhancer, restored_pairs(enhancer, chosen, transfer))
 
 
 @dataclass(frozen=True)

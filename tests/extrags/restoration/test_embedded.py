@@ -277,6 +277,55 @@ class TestEmbedded:
             assert isinstance(served, EmbeddedEnhancer)
             assert served.seamless == seamless
 
+    @pytest.mark.parametrize(
+        ("limit", "cloning", "seamless"), [(1e-6, "auto", True), (1e6, "auto", False), (1e-6, "never", False)]
+    )
+    def test_unjudged_unfamiliar_scenes_whose_training_is_not_kept_keep_what_is_known(
+        self,
+        tube: Tube,
+        tube_pairs: Pairs,
+        tmp_path: Path,
+        trained: EmbeddedEnhancer,
+        monkeypatch,
+        limit: float,
+        cloning: str,
+        seamless: bool,
+    ) -> None:
+        """The same weights serve as where nothing is trained."""
+        monkeypatch.setattr(scene_restorer, "make_pairs", lambda *_: tube_pairs)
+        features = sequence_features(trained.network, tube.sequence)
+        replace(trained, domain=replace(Domain.fitted(features, []), limit=limit)).save(tmp_path)
+        settings = {"scene_learning_rate": 0.5, "train_iterations": 1, "pretrained_weights": str(tmp_path)}
+        config = SMALL.model_copy(update={**settings, "judge": False, "seamless_cloning": cloning})
+        served = train_enhancer(tube.scene, tube.sequence, config, CoarseConfig())
+        assert isinstance(served, EmbeddedEnhancer)
+        assert served.record["scene_training_kept"] is False
+        assert served.seamless == seamless
+
+    def test_a_restorer_saved_for_a_scene_gives_another_one_its_weights_alone(
+        self, tube: Tube, tmp_path: Path, trained: EmbeddedEnhancer
+    ) -> None:
+        found = {"judged": {"restored_db": 1.0, "filled_db": 2.0}, "unjudged": "it was another scene"}
+        earlier = replace(
+            trained,
+            record={**trained.record, **found},
+            domain_score=2.0,
+            scene_calibrated=True,
+            untrained=trained,
+        )
+        earlier.cloning_seamlessly().save(tmp_path)
+        settings = {"train_iterations": 0, "pretrained_weights": str(tmp_path), "judge": False}
+        config = SMALL.model_copy(update={**settings, "seamless_cloning": "never"})
+        served = train_enhancer(tube.scene, tube.sequence, config, CoarseConfig())
+        assert isinstance(served, EmbeddedEnhancer)
+        assert not served.seamless
+        assert served.depth_from_image
+        assert served.domain_score is None
+        assert not served.scene_calibrated
+        assert never_trained_on(served) is served
+        for name in ("judged", "unjudged", "scene_training_kept"):
+            assert served.provenance[name] is None
+
     def test_validation_pairs_have_valid_pixels(self, tube_pairs: Pairs) -> None:
         chosen = np.flatnonzero(tube_pairs.validation)
         weight = tube_pairs.weight.clone()

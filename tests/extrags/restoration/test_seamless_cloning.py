@@ -4,20 +4,28 @@ from __future__ import annotations
 
 import copy
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from extrags.restoration.backends import load_enhancer
+from extrags.config import CoarseConfig, SeamlessCloning
+from extrags.restoration.backends import load_enhancer, train_enhancer
 from extrags.restoration.classical import ClassicalEnhancer
+from extrags.restoration.diffusion import scene_restorer
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
+from extrags.restoration.diffusion.error_fit import error_over_expected, with_calibration
 from extrags.restoration.diffusion.scene_restorer import best_of_all
 from extrags.restoration.diffusion.seamless_cloning import certainty, cloned_seamlessly
+from extrags.restoration.diffusion.validation import restored_pairs, validation_pairs
 from extrags.restoration.protocol import Clip, keeps_known
 from extrags.restoration.training_data.pairs import Pairs
+from extrags.restoration.uncertainty import calibration
+from extrags.restoration.uncertainty.calibration import Calibration
 from tests.extrags.lit_tube import Tube
+from tests.extrags.restoration.conftest import SMALL
 
 SIZE = (24, 32)
 HOLE = (slice(None), slice(None), slice(6, 18), slice(8, 24))
@@ -118,3 +126,35 @@ class TestRestorer:
         assert isinstance(plain, EmbeddedEnhancer)
         assert not plain.seamless
         assert "plain_db" not in plain.record["judged"]
+
+    @pytest.mark.parametrize("cloning", ["auto", "always"])
+    def test_its_expected_error_is_that_of_the_views_it_makes(
+        self, trained: EmbeddedEnhancer, tube: Tube, tube_pairs: Pairs, monkeypatch, cloning: SeamlessCloning
+    ) -> None:
+        """Where training on the scene has fitted it to the plain restorer's, which are far more wrong."""
+        monkeypatch.setattr(calibration, "MIN_CELLS", 50)
+        transfer, pairs = tube.references.transfer, validation_pairs(tube_pairs)
+        assert pairs is not None
+        harmful = shifting(trained)
+        fitted = with_calibration(harmful, restored_pairs(harmful, pairs, transfer))
+        given = fitted.cloning_seamlessly() if cloning == "always" else fitted
+        served = best_of_all([given], tube_pairs, transfer, of_weights=Calibration(), cloning=cloning)
+        assert isinstance(served, EmbeddedEnhancer)
+        assert served.seamless
+        ratio = error_over_expected(served, restored_pairs(served, pairs, transfer))
+        assert ratio == pytest.approx(1, abs=0.2)
+
+    def test_unjudged_its_expected_error_is_that_as_well(
+        self, trained: EmbeddedEnhancer, tube: Tube, tube_pairs: Pairs, tmp_path: Path, monkeypatch
+    ) -> None:
+        monkeypatch.setattr(calibration, "MIN_CELLS", 50)
+        monkeypatch.setattr(scene_restorer, "make_pairs", lambda *_: tube_pairs)
+        shifting(trained).save(tmp_path)
+        settings = {"scene_learning_rate": 0.5, "train_iterations": 1, "pretrained_weights": str(tmp_path)}
+        config = SMALL.model_copy(update={**settings, "judge": False, "seamless_cloning": "always"})
+        served = train_enhancer(tube.scene, tube.sequence, config, CoarseConfig())
+        assert isinstance(served, EmbeddedEnhancer)
+        pairs = validation_pairs(tube_pairs)
+        assert pairs is not None
+        ratio = error_over_expected(served, restored_pairs(served, pairs, tube.references.transfer))
+        assert ratio == pytest.approx(1, abs=0.2)

@@ -44,7 +44,7 @@ def find_weights(setting: str) -> tuple[Path, ...]:
     Args:
         setting: `bundled`, one of `PACKAGED`, `none`, or the path of a .safetensors file with its .json
             beside it, or of a folder that holds `restorer.safetensors` and `restorer.json` (a saved restorer
-            is one).
+            is one: its weights count, and nothing that it was told of its scene).
 
     Returns:
         The .safetensors files, the description of each beside it with the suffix .json: all that the package
