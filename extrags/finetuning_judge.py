@@ -35,7 +35,7 @@ from extrags.store.storable import Storable
 from extrags.threads import one_torch_thread
 from extrags.training.finetuning import finetune
 from extrags.training.frame_weights import FrameWeights, frame_weights
-from extrags.training.leave_out import MIN_FRAMES, leave_out_folds, partial_scene
+from extrags.training.leave_out import MIN_FRAMES, leave_out_folds, partial_scene, show_tissue
 
 __all__ = ["AMOUNTS", "Judgement", "Trial", "decide", "judge_finetuning"]
 
@@ -200,7 +200,7 @@ def judge_finetuning(
     enhancer = None if enhancer is None else never_trained_on(enhancer)
     arms = list(_arms(scene, sequence, trajectories, enhancer, config, enhance, coarse, measure))
     if not arms:
-        return Judgement(1.0, "not judged: no training frame that can be left out has a valid pixel")
+        return Judgement(1.0, "not judged: no training frame with a valid pixel can be left out")
     scenes: dict[float | None, list[Scene]] = {None: [arm.start for arm in arms]}
     before = _psnr_of_arms(arms, scenes[None])
     # The control of virtual views differs from them in nothing else, and so has no cool-down either.
@@ -342,7 +342,7 @@ def _without_some_frames(
     """The sequence with splits that hold out some training frames, and their positions among these.
 
     One split leaves out a share of the frames; where that makes fewer than `MIN_LEFT_OUT`, others follow.
-    Frames without a valid pixel tell nothing: they are not among those left out.
+    Frames without a valid pixel tell nothing: they are not among those left out, nor is a scene made of them.
     """
     folds = leave_out_folds(frames, every)
     # From the middle: the first fold would leave out the ends of the path, which nothing surrounds.
@@ -350,7 +350,7 @@ def _without_some_frames(
     for fold in sorted(range(len(folds)), key=lambda fold: (abs(fold - len(folds) // 2), -fold)):
         kept, left = folds[fold]
         left = left[[bool(sequence.mask[frame].any()) for frame in left]]
-        if not len(left):
+        if not len(left) or not show_tissue(sequence, kept):
             continue
         yield replace(sequence, split=Split("leave-out", kept, left)), np.flatnonzero(np.isin(frames, left))
         count += len(left)

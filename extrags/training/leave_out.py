@@ -23,7 +23,7 @@ from extrags.training.reconstruction import coarse_schedule, scene_extent, small
 from extrags.training.starting import median_depth, starting_gaussians, valid_pixels
 from extrags.training.views import epochs
 
-__all__ = ["MIN_FRAMES", "leave_out_folds", "log_exposures", "partial_scene"]
+__all__ = ["MIN_FRAMES", "leave_out_folds", "log_exposures", "partial_scene", "show_tissue"]
 
 MIN_FRAMES = 4
 """With fewer training frames none can be left out."""
@@ -55,6 +55,16 @@ def leave_out_folds(
     blocks = min(BLOCKS_PER_FOLD * parts, len(frames))
     owner = np.arange(len(frames)) * blocks // len(frames) % parts
     return [(frames[owner != fold], frames[owner == fold]) for fold in range(folds)]
+
+
+def show_tissue(sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]) -> bool:
+    """Whether any of the frames has a valid pixel: without one there is nothing to reconstruct from.
+
+    Args:
+        sequence: frames.
+        frames: which of them to look at.
+    """
+    return any(bool(sequence.mask[frame].any()) for frame in frames)
 
 
 def partial_scene(

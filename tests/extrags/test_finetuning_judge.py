@@ -304,7 +304,16 @@ def test_frames_without_valid_pixels_do_not_judge(tube: Tube, monkeypatch: pytes
     )
     nothing = judged(replace(tube, sequence=replace(tube.sequence, mask=mask)), None)
     assert (nothing.amount, nothing.trials) == (1.0, ())
-    assert nothing.reason.startswith("not judged: no training frame that can be left out")
+    assert nothing.reason.startswith("not judged: no training frame with a valid pixel can be left out")
+
+
+def test_what_is_left_of_the_frames_has_valid_pixels(tube: Tube) -> None:
+    """Of the only frame with tissue nothing can be learned where it is left out."""
+    mask = np.zeros_like(tube.sequence.mask)
+    mask[tube.sequence.train[4]] = True
+    found = judged(replace(tube, sequence=replace(tube.sequence, mask=mask)), None)
+    assert found.amount == 1.0
+    assert found.reason.startswith("not judged: no training frame with a valid pixel can be left out")
 
 
 def test_off_or_too_few_frames_keep_everything(tube: Tube) -> None:

@@ -23,7 +23,7 @@ from extrags.restoration.diffusion.validation import (
     validation_pairs,
 )
 from extrags.restoration.protocol import Enhancer
-from extrags.restoration.training_data.pairs import Pairs, make_pairs
+from extrags.restoration.training_data.pairs import Pairs, make_pairs, usable_folds
 from extrags.restoration.uncertainty.calibration import Calibration
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
@@ -65,10 +65,10 @@ def scene_restorer(
         untouched = [_as_asked(restorer.with_settings(config, gamut, patches), config) for restorer in known]
         if not config.judge:
             return _cloning_outside(untouched[0], JUDGE_OFF, config.seamless_cloning)
-        if len(sequence.train) < MIN_FRAMES:
-            few = f"{len(sequence.train)} training frames are too few to leave some out"
-            logger.warning("the restorer is not judged: %s", few)
-            return _cloning_outside(untouched[0], few, config.seamless_cloning)
+        unjudged = _why_unjudged(sequence, config)
+        if unjudged is not None:
+            logger.warning("the restorer is not judged: %s", unjudged)
+            return _cloning_outside(untouched[0], unjudged, config.seamless_cloning)
         # Nothing is trained, so all leave-out pairs validate; synthetic ones would favour filling holes.
         leave_out = config.model_copy(update={"synthetic_views": 0})
         fresh = make_pairs(scene, sequence, leave_out, coarse, most=config.judge_pairs)
@@ -84,6 +84,15 @@ def scene_restorer(
         return _recalibrated(trained, pairs, transfer)
     weights = Calibration() if start is None else start.calibration
     return best_of_all([trained], pairs, transfer, of_weights=weights, cloning=config.seamless_cloning)
+
+
+def _why_unjudged(sequence: EndoscopicSequence, config: EnhanceConfig) -> str | None:
+    """Why no training frames can be left out; None where some can be."""
+    if len(sequence.train) < MIN_FRAMES:
+        return f"{len(sequence.train)} training frames are too few to leave some out"
+    if not usable_folds(sequence, config):
+        return "no training frame with a valid pixel can be left out"
+    return None
 
 
 def _as_asked(restorer: EmbeddedEnhancer, config: EnhanceConfig) -> EmbeddedEnhancer:

@@ -22,13 +22,19 @@ from extrags.events import Progress, emit
 from extrags.gaussians import Gaussians
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence, saturated_mask
-from extrags.training.leave_out import MIN_FRAMES, leave_out_folds, log_exposures, partial_scene
+from extrags.training.leave_out import (
+    MIN_FRAMES,
+    leave_out_folds,
+    log_exposures,
+    partial_scene,
+    show_tissue,
+)
 from extrags.training.starting import surface_normals
 from extrags.view_synthesis.conditioning import Layers, observe_views
 from extrags.view_synthesis.gather import gather_references
 from extrags.view_synthesis.references import ReferenceViews
 
-__all__ = ["Pairs", "fold_pairs", "make_pairs", "pair_views", "synthetic_pairs"]
+__all__ = ["Pairs", "fold_pairs", "make_pairs", "pair_views", "synthetic_pairs", "usable_folds"]
 
 VALIDATION_EVERY = 5
 """Every n-th training frame is a target of the validation only."""
@@ -111,7 +117,7 @@ def make_pairs(
     *,
     most: int | None = None,
 ) -> Pairs:
-    """All pairs of a scene.
+    """All pairs of a scene; folds that keep no frame with a valid pixel give none.
 
     Args:
         scene: the coarse scene, trained on `sequence.train`; leave-out reconstructions run where it is.
@@ -121,18 +127,32 @@ def make_pairs(
         most: about so many leave-out pairs at most, two of every frame that is taken; None takes all.
 
     Raises:
-        CaptureError: with fewer than four training frames.
+        CaptureError: with fewer than four training frames, or when there is no pair at all.
     """
     parts = []
-    folds = len(leave_out_folds(np.asarray(sequence.train, dtype=np.int64), config.folds))
-    frames = None if most is None else max(1, most // (2 * folds))
-    for fold in range(folds):
+    folds = usable_folds(sequence, config)
+    frames = None if most is None else max(1, most // (2 * max(1, len(folds))))
+    for done, fold in enumerate(folds, start=1):
         parts.append(fold_pairs(scene, sequence, config, coarse, fold, most_frames=frames))
-        emit(Progress("enhance-pairs", fold + 1, folds + 1))
+        emit(Progress("enhance-pairs", done, len(folds) + 1))
     if config.synthetic_views > 0:
         parts.append(synthetic_pairs(scene, sequence, config))
-    emit(Progress("enhance-pairs", folds + 1, folds + 1))
+    emit(Progress("enhance-pairs", len(folds) + 1, len(folds) + 1))
     return Pairs.concatenated(parts)
+
+
+def usable_folds(sequence: EndoscopicSequence, config: EnhanceConfig) -> list[int]:
+    """Folds of which a scene can be reconstructed: some frame that is kept has a valid pixel.
+
+    Args:
+        sequence: frames; only training frames are looked at.
+        config: number of folds.
+
+    Raises:
+        CaptureError: with fewer than four training frames.
+    """
+    folds = leave_out_folds(np.asarray(sequence.train, dtype=np.int64), config.folds)
+    return [fold for fold, (kept, _) in enumerate(folds) if show_tissue(sequence, kept)]
 
 
 def fold_pairs(

@@ -28,6 +28,7 @@ from extrags.restoration.uncertainty import calibration
 from extrags.restoration.uncertainty.calibration import Calibration
 from extrags.restoration.uncertainty.domain import Domain
 from extrags.thresholds import HOLE_ALPHA
+from extrags.training.leave_out import leave_out_folds
 from extrags.view_synthesis.gamut import Gamut
 from tests.extrags.lit_tube import Tube
 from tests.extrags.restoration.conftest import SMALL
@@ -276,6 +277,20 @@ class TestEmbedded:
             served = train_enhancer(tube.scene, tube.sequence, config, CoarseConfig())
             assert isinstance(served, EmbeddedEnhancer)
             assert served.seamless == seamless
+
+    def test_unjudged_where_frames_without_tissue_would_be_all_that_is_kept(
+        self, tube: Tube, tmp_path: Path, trained: EmbeddedEnhancer, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        trained.save(tmp_path)
+        settings = {"train_iterations": 0, "pretrained_weights": str(tmp_path), "folds": 1}
+        config = SMALL.model_copy(update=settings)
+        _, left = leave_out_folds(tube.sequence.train, config.folds)[0]
+        mask = np.zeros_like(tube.sequence.mask)
+        mask[left[0]] = True
+        alone = replace(tube.sequence, mask=mask)
+        served = train_enhancer(tube.scene, alone, config, CoarseConfig())
+        assert isinstance(served, EmbeddedEnhancer)
+        assert "the restorer is not judged: no training frame with a valid pixel" in caplog.text
 
     @pytest.mark.parametrize(
         ("limit", "cloning", "seamless"), [(1e-6, "auto", True), (1e6, "auto", False), (1e-6, "never", False)]

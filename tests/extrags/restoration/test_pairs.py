@@ -16,6 +16,7 @@ from extrags.restoration.training_data.pairs import (
     fold_pairs,
     make_pairs,
     synthetic_pairs,
+    usable_folds,
 )
 from extrags.sequence import Split
 from extrags.training.leave_out import leave_out_folds
@@ -76,6 +77,18 @@ class TestPairs:
         told = rf"{blind.name}: no surface is known at any valid pixel of the training frames \w+, \w+"
         with pytest.raises(CaptureError, match=told):
             synthetic_pairs(tube.scene, blind, SMALL)
+
+    def test_a_fold_that_keeps_no_tissue_gives_no_pair(self, tube: Tube) -> None:
+        mask = tube.sequence.mask.copy()
+        mask[tube.sequence.train[:-1]] = False
+        alone = replace(tube.sequence, mask=mask)
+        config = SMALL.model_copy(update={"fold_iterations": 2, "synthetic_views": 0})
+        coarse = CoarseConfig(max_points=300, densify=DensifyConfig(max_gaussians=500))
+        (usable,) = usable_folds(alone, config)
+        pairs = make_pairs(tube.scene, alone, config, coarse)
+        _, left = leave_out_folds(alone.train, config.folds)[usable]
+        assert set(pairs.frame) == set(left)
+        assert not pairs.weight.any()
 
     def test_more_folds_than_frames(self, tube: Tube) -> None:
         split = replace(tube.sequence.split, train=tube.sequence.train[:4])
