@@ -65,7 +65,7 @@ class WithoutReferences:
 class Agreed:
     """A restorer whose views of a clip agree on what they have invented.
 
-    Restored renders do so as well, unless the restorer only blends and fills.
+    Restored renders do so as well, unless the restorer keeps what is known (`keeps_known`).
 
     Args:
         enhancer: the restorer.
@@ -104,7 +104,7 @@ class Textured:
     """A restorer whose invented surfaces get texture of the scene's own frames.
 
     Restored renders do so as well, at the mean of this depth and the final scene's; no network refines them
-    where the restorer only blends and fills.
+    where the restorer keeps what is known (`keeps_known`).
 
     Args:
         enhancer: the restorer.
