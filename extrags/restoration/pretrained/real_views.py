@@ -8,8 +8,10 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
+from torch import Tensor
 
 from extrags.errors import ShapeError
+from extrags.frame_stacks import frames_of, stacked
 from extrags.restoration.protocol import Clip
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
@@ -64,19 +66,24 @@ class RealViews:
         Raises:
             ShapeError: when the light's exposures are not those of the training frames.
         """
-        frames = sequence.train
-        rgb = sequence.rgb[frames]
-        light = scene.light
-        if light is not None:
-            if len(light.log_exposure) != len(frames):
-                raise ShapeError(
-                    f"the scene's light has {len(light.log_exposure)} exposures for {len(frames)} frames"
-                )
-            gains = light.exposures().detach()[:, None, None, None]
-            signal = light.invert_response(torch.from_numpy(rgb.astype(np.float32) / 255))
-            balanced = light.apply_response(signal / gains).detach().clamp(0, 1).numpy()
-            rgb = np.rint(balanced * 255).astype(np.uint8)
-        return cls(rgb, sequence.cameras.world_from_camera[frames])
+        frames, light = sequence.train, scene.light
+        poses = sequence.cameras.world_from_camera[frames]
+        if light is None:
+            return cls(frames_of(sequence.rgb, frames), poses)
+        if len(light.log_exposure) != len(frames):
+            raise ShapeError(
+                f"the scene's light has {len(light.log_exposure)} exposures for {len(frames)} frames"
+            )
+
+        def at_mean_exposure(frame: int, gain: Tensor) -> UInt8[np.ndarray, "h w 3"]:
+            signal = light.invert_response(torch.from_numpy(sequence.rgb[frame].astype(np.float32) / 255))
+            balanced = light.apply_response(signal / gain).detach().clamp(0, 1).numpy()
+            return np.asarray(np.rint(balanced * 255).astype(np.uint8))
+
+        # One at a time: as floats, the frames of a long recording would not be in memory at once.
+        gains = light.exposures().detach()
+        found = (at_mean_exposure(int(frame), gain) for frame, gain in zip(frames, gains, strict=True))
+        return cls(stacked(found, len(frames)), poses)
 
     def save(self, path: Path) -> None:
         """Write a zarr v3 group, one frame per chunk."""

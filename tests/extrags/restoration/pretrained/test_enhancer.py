@@ -18,6 +18,7 @@ import torch
 from extrags.confidence import PerceptualDifference
 from extrags.config import CoarseConfig, EnhanceConfig, PretrainedConfig
 from extrags.errors import ConfigError, MissingDependencyError, WeightsError
+from extrags.illumination import NearFieldLight
 from extrags.model_files import fingerprint
 from extrags.restoration.backends import backend_of, load_enhancer, train_enhancer
 from extrags.restoration.clips import make_pseudo_observations, render_clips
@@ -155,6 +156,28 @@ class TestInputs:
         again = RealViews.load(tmp_path / "views")
         assert np.array_equal(again.rgb, views.rgb)
         assert np.array_equal(again.world_from_camera, views.world_from_camera)
+
+    def test_real_views_of_a_long_recording_are_not_in_memory_at_once(
+        self, tube: Tube, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """Each at its own gain, and as floats one at a time."""
+        count = len(tube.sequence.train)
+        light = tube.scene.light
+        assert light is not None
+        light = replace(light, log_exposure=torch.linspace(-0.6, 0.6, count))
+        sizes: list[tuple[int, ...]] = []
+        inverted = NearFieldLight.invert_response
+
+        def counted(self: NearFieldLight, rgb: torch.Tensor) -> torch.Tensor:
+            sizes.append(tuple(rgb.shape))
+            return inverted(self, rgb)
+
+        monkeypatch.setattr(NearFieldLight, "invert_response", counted)
+        views = RealViews.gather(replace(tube.scene, light=light), tube.sequence)
+        assert sizes == count * [(HEIGHT, WIDTH, 3)]
+        signal = inverted(light, torch.from_numpy(tube.sequence.rgb[tube.sequence.train] / np.float32(255)))
+        balanced = light.apply_response(signal / light.exposures()[:, None, None, None]).clamp(0, 1)
+        assert np.array_equal(views.rgb, (balanced * 255).round().to(torch.uint8).numpy())
 
     def test_real_views_are_shown_at_the_exposure_of_the_clip(self, tube: Tube, clip: Clip) -> None:
         views = RealViews.gather(tube.scene, tube.sequence)
