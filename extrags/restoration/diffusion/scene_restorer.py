@@ -157,6 +157,7 @@ def best_of_all(
     plain = best
     if best.restored_db < filled - tolerated and cloning == "auto":
         best = _best([each.cloning_seamlessly() for each in restorers], validating, transfer)
+    if best.restorer.seamless:
         tolerated = MAX_LOSS_CLONING_DB
     enhancer, means, restored = best.restorer, best.means, best.restored_db
     emit(MetricRecorded("enhance", "judged_gain_over_classical_db", restored - filled))

@@ -257,6 +257,27 @@ class TestEmbedded:
         assert isinstance(served, EmbeddedEnhancer) == (served_by != "filling")
         assert getattr(served, "seamless", False) == (served_by == "seamless")
 
+    @pytest.mark.parametrize(("lost_db", "serves"), [(0.05, True), (0.3, False)])
+    @pytest.mark.parametrize("score", [0.9, 1.1])
+    def test_what_clones_by_hand_is_held_to_the_same(
+        self,
+        trained: EmbeddedEnhancer,
+        tube_pairs: Pairs,
+        tube: Tube,
+        monkeypatch,
+        lost_db: float,
+        score: float,
+        serves: bool,
+    ) -> None:
+        scores = {
+            f"embedded_{trained.steps}": {"psnr_kept": 20.0},
+            "classical": {"psnr_kept": 20.0 + lost_db},
+        }
+        monkeypatch.setattr(scene_restorer, "scores_of", lambda *_: scores)
+        cloning = replace(trained, domain_score=score).cloning_seamlessly()
+        served = best_of_all([cloning], tube_pairs, tube.references.transfer, cloning="always")
+        assert isinstance(served, EmbeddedEnhancer) == serves
+
     @pytest.mark.parametrize("judge", [True, False])
     def test_unjudged_unfamiliar_scenes_keep_what_is_known(
         self, tube: Tube, tmp_path: Path, trained: EmbeddedEnhancer, monkeypatch, judge: bool
