@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from extrags.cameras import Cameras, pixel_rays
-from extrags.config import EnhanceConfig, SurfaceConfig
+from extrags.config import EnhanceConfig, PipelineConfig, SurfaceConfig
 from extrags.depth import estimate
 from extrags.depth.estimate import DepthEstimate
 from extrags.errors import ShapeError
@@ -17,6 +17,7 @@ from extrags.evaluation import render
 from extrags.gaussians import Gaussians
 from extrags.radial_lens import WIDE_FIELD_DEG, RadialLens
 from extrags.restoration import restored_renders as restored_renders_module
+from extrags.restoration.benchmark.comparison import compare_methods
 from extrags.restoration.classical import ClassicalEnhancer
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence, Split
@@ -83,6 +84,14 @@ def test_references_are_pinholes(facing_a_wall: EndoscopicSequence, wall: Scene)
     flat = facing_a_wall.as_pinhole()
     found = gather_references(wall, flat, flat.train)
     assert found.cameras.lens is None
+
+
+def test_restorers_are_compared_on_pinholes(facing_a_wall: EndoscopicSequence, wall: Scene) -> None:
+    config = PipelineConfig(enhance=EnhanceConfig(references=2))
+    none, classical = compare_methods(wall, facing_a_wall, config, ["none", "classical"], None)
+    assert classical["views"] == 1
+    # The wall's colours are known from the other frames alone.
+    assert classical["psnr"] > none["psnr"] + 3
 
 
 def test_estimated_depth_comes_back_to_the_pixels(

@@ -244,7 +244,7 @@ def compare_methods(
     methods: Sequence[str],
     lpips: LpipsByNet | None,
 ) -> list[dict[str, Any]]:
-    """Compare methods on the held-out views of a sequence.
+    """Compare methods on the held-out views of a sequence, of frames through a lens as pinholes.
 
     Args:
         scene: its coarse scene.
@@ -263,6 +263,8 @@ def compare_methods(
         ConfigError: for an unknown method.
     """
     methods = check_methods(methods)
+    # Restorers see pinholes, as in a run.
+    sequence = sequence.as_pinhole()
     training = sequence.training_part()
     references = gather_references(scene, training, training.train)
     clips = held_out_clips(
