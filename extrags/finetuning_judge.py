@@ -464,5 +464,12 @@ def decide(trials: Sequence[Trial], max_loss_db: float, left: Int[np.ndarray, "m
         amount = 0.0
         outcome = "fine-tuning is on real views alone"
     else:
-        outcome = f"all lose more than {max_loss_db:g} dB: the coarse scene is kept"
+        why = f"all lose more than {max_loss_db:g} dB"
+        if any(trial.gain_db >= -max_loss_db for trial in trials):
+            # Virtual views were compared with real ones whose light did not come to rest.
+            why = (
+                f"real views alone lose more than {max_loss_db:g} dB where their light comes to rest, and "
+                "virtual ones fall behind them where it does not"
+            )
+        outcome = f"{why}: the coarse scene is kept"
     return Judgement(amount, f"{frames}; {outcome}", tuple(trials), tuple(left.tolist()))

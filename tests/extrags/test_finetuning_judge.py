@@ -96,6 +96,16 @@ def test_what_is_kept(
     assert ("lose no more than 0.1 dB against the coarse scene" in found.reason) == bool(amount)
 
 
+def test_why_neither_holds() -> None:
+    """Real views alone gained 1.5 dB without a cool-down: virtual ones fall behind that, and gain."""
+    alone, behind = trial(0.0, -0.3, -0.3), trial(0.1, 0.5, 1.5)
+    found = decide([alone, behind], 0.1, np.array([3, 4]))
+    assert found.amount is None
+    assert "all lose" not in found.reason
+    assert "where their light comes to rest" in found.reason
+    assert "all lose more than 0.1 dB" in decide([alone, trial(0.1, -0.5, -0.3)], 0.1, np.array([3])).reason
+
+
 def test_a_restorer_that_destroys_is_left_out(tube: Tube) -> None:
     config = FINETUNE.model_copy(update={"keep_known": False})
     destroyed = judged(tube, Destroyer(""), config)
