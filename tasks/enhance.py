@@ -165,7 +165,7 @@ def train(
     train_enhancer(shown, frames, config, coarse).save(slot.path / RESTORER)
 
 
-@stage("enhance-keyframes", version=9)
+@stage("enhance-keyframes", version=10)
 def keyframes(
     slot: Slot, scene: Ref, sequence: Ref, explore: Ref, restorer: Ref, config: EnhanceConfig
 ) -> None:
@@ -191,7 +191,7 @@ def keyframes(
 
 
 # The weights' digest is in the key; where their file lies is not.
-@stage("enhance-restore", version=13, ignore=("weights",))
+@stage("enhance-restore", version=14, ignore=("weights",))
 def restore(
     slot: Slot,
     scene: Ref,

@@ -175,8 +175,10 @@ def _followed(
 ) -> Layers:
     layers = Layers(layers.data.clone())
     alpha = layers.get("alpha")
+    # As near as the scene itself is rendered: in a small unit, all discs may be nearer than without a light.
+    near = Scene(invented.surface.gaussians, invented.views.transfer.light).near
     with torch.no_grad():
-        rendering = invented.surface.render(camera, median_depth=True)
+        rendering = invented.surface.render(camera, median_depth=True, near=near)
     if rendering.median_depth is None:
         raise ShapeError("the rasteriser returned no median depth")
     share, median = rendering.alpha[:, None], rendering.median_depth[:, None]

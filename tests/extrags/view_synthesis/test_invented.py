@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -17,6 +19,7 @@ from extrags.view_synthesis.conditioning import (
     observe_views,
 )
 from extrags.view_synthesis.invented import InventedViews, evidence, with_invented
+from extrags.view_synthesis.references import LightTransfer
 from tests.extrags.lit_tube import HEIGHT, WIDTH, Tube, cast_tube, tube_cameras
 
 VIEWS = tube_cameras(4, offset_mm=4.0, start_mm=16.0)
@@ -80,6 +83,26 @@ class TestInvented:
             (filled_depth(one, scale) / truth).log().abs()[inside].mean() for one in (layers, followed)
         )
         assert after < 0.5 * before
+
+    def test_it_is_the_same_in_another_unit(self, tube: Tube, layers: Layers, followed: Layers) -> None:
+        """Of which a whole scene may be less than the distance where rendering begins in millimetres."""
+        unit = 1e-4
+        poses = VIEWS.world_from_camera.copy()
+        poses[:, :3, 3] *= unit
+        views = replace(VIEWS, world_from_camera=poses)
+        given = tube.references.transfer
+        assert given.light is not None
+        light = replace(given.light, reference_distance=unit * given.light.reference_distance)
+        rgb, depth = true_views(tube, VIEWS[:2])
+        missing = (1 - known_share(layers[:2])).clamp(0, 1)
+        transfer = LightTransfer(light, given.exponent, unit * given.scale_mm)
+        invented = InventedViews.of_views(views[:2], rgb, unit * depth, missing, torch.ones(2), transfer)
+        small = Layers(layers.data.clone())
+        small.get("depth_mm").mul_(unit)
+        found = with_invented(small, invented, views)
+        for name in ("invented", "invented_weight"):
+            off = (found.get(name) - followed.get(name)).abs()
+            assert off.mean() < 1e-4, name
 
     def test_what_is_known_stays(self, layers: Layers, followed: Layers) -> None:
         known = known_share(layers)
