@@ -174,8 +174,9 @@ def judge_finetuning(
         scene: the coarse scene, trained on `sequence.train`; trials are optimised where it is.
         sequence: posed frames; only training frames are used.
         trajectories: virtual views of each trajectory, its real start first.
-        enhancer: the scene's restorer; None where there are no virtual views. One that was trained on the
-            scene has learned from frames that are left out here: what it was before restores in its place.
+        enhancer: the scene's restorer; None, as no virtual view, leaves the control alone. One that was
+            trained on the scene has learned from frames that are left out here: what it was before restores
+            in its place.
         config: settings of the fine-tuning; None takes those of the profile `balanced`.
         enhance: settings of the restoration; None takes those of the profile `balanced`.
         coarse: settings the scene was reconstructed with; None takes those of the profile `balanced`.
@@ -197,7 +198,9 @@ def judge_finetuning(
         return Judgement(
             1.0, f"not judged: of {n_frames} training frames none can be left out (at least {MIN_FRAMES})"
         )
-    enhancer = None if enhancer is None else never_trained_on(enhancer)
+    # As in restoration: the start of a trajectory is real.
+    trajectories = [cameras for cameras in trajectories if len(cameras) > 1]
+    enhancer = None if enhancer is None or not trajectories else never_trained_on(enhancer)
     arms = list(_arms(scene, sequence, trajectories, enhancer, config, enhance, coarse, measure))
     if not arms:
         return Judgement(1.0, "not judged: no training frame with a valid pixel can be left out")

@@ -184,10 +184,10 @@ def make_keyframes(
         exposure: gain of each view; None is 1.
 
     Returns:
-        The keyframes; none where nothing is missing, or the restorer does not follow any.
+        The keyframes; none without any view, where nothing is missing, or where the restorer follows none.
     """
     none = Keyframes.none(trajectories[0])
-    if config.keyframes == 0 or not follows_keyframes(enhancer):
+    if config.keyframes == 0 or not follows_keyframes(enhancer) or not any(map(len, trajectories)):
         return none
     places = [(clip, view) for clip, cameras in enumerate(trajectories) for view in range(len(cameras))]
     chosen = _chosen_views(scene, references, trajectories, config)

@@ -119,6 +119,15 @@ def test_a_restorer_that_destroys_is_left_out(tube: Tube) -> None:
     assert judged(tube, None, without).trials[0] != control
 
 
+@pytest.mark.parametrize("starts", [[], [tube_cameras(1)]])
+def test_without_virtual_views_real_ones_alone_are_judged(tube: Tube, starts: list[Cameras]) -> None:
+    config = FINETUNE.model_copy(update={"iterations": 10})
+    found = judge_finetuning(
+        tube.scene, tube.sequence, starts, Destroyer(""), config, ENHANCE, COARSE, measure=WITHOUT_WEIGHTS
+    )
+    assert found == judged(tube, None, config)
+
+
 class Trained(ClassicalEnhancer):
     """A restorer that has learned from the frames of the scene, and before that destroyed."""
 

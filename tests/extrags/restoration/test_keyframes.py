@@ -165,6 +165,11 @@ class TestKeyframes:
             assert len(found) == 0
             assert found.invented(tube.references.transfer) is None
 
+    def test_none_without_any_view(self, tube: Tube) -> None:
+        nothing = [TRAJECTORIES[0][:0]]
+        found = make_keyframes(tube.scene, tube.references, nothing, ClassicalEnhancer(), SETTINGS)
+        assert len(found) == 0
+
     def test_save_and_load(self, tube: Tube, tmp_path: Path) -> None:
         found = restore_keyframes(tube.scene, tube.sequence, TRAJECTORIES, ClassicalEnhancer(), SETTINGS)
         for number, one in enumerate((found, Keyframes.none(TRAJECTORIES[0]))):
