@@ -412,20 +412,15 @@ class Store:
             log.warning("could not keep the debugging files of %s: %s", key, problem)
 
     def ls(self, pattern: str = "*") -> list[Manifest]:
-        """Manifests of the artefacts whose key, stage or label matches a shell pattern, by stage and age.
+        """Manifests of the artefacts whose key, stage or label matches a shell pattern, by age.
 
-        Those with a damaged manifest are left out, with a warning.
+        Those whose manifest is damaged, or not for this user, are left out, with a warning.
 
         Raises:
-            StoreError: when the store cannot be read.
+            StoreError: as `manifests`.
         """
-        manifests = [self._readable_manifest(key) for key in self.backend.names()]
-        chosen = [
-            item
-            for item in manifests
-            if item is not None and _matches(pattern, item.key, item.stage, item.label)
-        ]
-        return sorted(chosen, key=lambda manifest: (manifest.started, manifest.key))
+        found, _ = self.manifests()
+        return [item for item in found if _matches(pattern, item.key, item.stage, item.label)]
 
     def manifests(self) -> tuple[list[Manifest], list[str]]:
         """Manifests of all artefacts, and keys of those whose manifest cannot be read, with a warning each.
@@ -450,24 +445,25 @@ class Store:
                 found += [] if manifest is None else [manifest]
         return sorted(found, key=lambda manifest: (manifest.started, manifest.key)), unreadable
 
-    def _readable_manifest(self, key: str) -> Manifest | None:
-        try:
-            return self.backend.read_manifest(key)
-        except StoreError as error:
-            log.warning("%s", _as_damage(error, key, self.root))
-            return None
-
     def rm(self, pattern: str) -> list[str]:
         """Remove artefacts by a shell pattern over key, stage or label; returns their keys.
 
-        Of those with a damaged manifest the label is not known; they go by key or stage.
+        Of those with a damaged manifest the label is not known; they go by key or stage. Those whose manifest
+        this user may not read may be whole: they go by their own key alone, or are left, with a warning.
+
+        Raises:
+            StoreError: as `manifests`, and when one cannot be removed.
         """
         chosen = []
         for key in self.backend.names():
             try:
                 manifest = self.backend.read_manifest(key)
             except StoreError as error:
-                _as_damage(error, key, self.root)
+                if "://" in self.root and not isinstance(error, DamagedArtefactError):
+                    raise
+                if not _tells_damage(error) and key != pattern:
+                    log.warning("%s is left: %s", key, error)
+                    continue
                 about, started = [stage_of(key)], ""
             else:
                 if manifest is None:
@@ -516,6 +512,14 @@ class Store:
         return removed + self.backend.remove_damaged(dry_run=dry_run)
 
 
+def _tells_damage(error: StoreError) -> bool:
+    """Whether a manifest that could not be read is damaged: by its content, or as the disk says."""
+    cause = error.__cause__
+    return isinstance(error, DamagedArtefactError) or (
+        isinstance(cause, OSError) and cause.errno == errno.EIO
+    )
+
+
 def _as_damage(error: StoreError, key: str, root: str) -> DamagedArtefactError:
     """What is wrong with an artefact whose manifest could not be read.
 
@@ -528,7 +532,7 @@ def _as_damage(error: StoreError, key: str, root: str) -> DamagedArtefactError:
     if isinstance(error, DamagedArtefactError):
         return error
     cause = error.__cause__
-    if "://" in root or not isinstance(cause, OSError) or cause.errno != errno.EIO:
+    if "://" in root or not _tells_damage(error) or not isinstance(cause, OSError):
         raise error
     problem = f"cannot be read: {cause.strerror}"
     return DamagedArtefactError(problem, file=MANIFEST, stage=stage_of(key), key=key, store=root)
