@@ -37,9 +37,10 @@ _SHORTEST = 8
 
 def without_credentials(text: str) -> str:
     """The text with `***` in place of each credential; text without any comes back as it was."""
-    for value in _secret_values():
-        if value in text:
-            text = text.replace(value, HIDDEN)
+    if len(text) >= _SHORTEST:
+        for value in _secret_values():
+            if value in text:
+                text = text.replace(value, HIDDEN)
     if "://" in text:
         text = _USER.sub(rf"\g<scheme>{HIDDEN}@", text)
         text = _QUERY.sub(rf"\g<name>{HIDDEN}", text)

@@ -107,13 +107,16 @@ class StageConfig(BaseModel):
     @field_validator("*", mode="before")
     @classmethod
     def _without_truth_value(cls, value: Any, info: ValidationInfo) -> Any:
-        check_truth_value(value, cls.model_fields[str(info.field_name)].annotation)
+        # A plan validates thousands of values, hardly any of which can be a truth value.
+        if isinstance(value, bool | list | tuple):
+            check_truth_value(value, cls.model_fields[str(info.field_name)].annotation)
         return value
 
     @field_validator("*")
     @classmethod
     def _not_too_large(cls, value: Any, info: ValidationInfo) -> Any:
-        check_size(value, cls.model_fields[str(info.field_name)].metadata)
+        if isinstance(value, int | tuple):
+            check_size(value, cls.model_fields[str(info.field_name)].metadata)
         return value
 
     @field_validator("*")
