@@ -81,6 +81,7 @@ def pytest_collection() -> Generator[None, object, object]:
     try:
         return (yield)
     finally:
+        gc.freeze()
         gc.enable()
 
 
@@ -93,6 +94,20 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         for item in items:
             if "slow" in item.keywords:
                 item.add_marker(skip)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_thread_of_the_kernels() -> None:
+    """As `pytest_configure` has it for torch: where several processes run tests, none divides its work.
+
+    A thread that helps waits actively for the next kernel, which cost half as much again as the kernels
+    themselves. Tests of threads set their number.
+    """
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        from extrags.raster import native
+
+        if native.native_isa():
+            native.set_num_threads(1)
 
 
 @pytest.fixture(scope="session")

@@ -18,6 +18,8 @@ from prefect.settings import (
 )
 from prefect.testing.utilities import prefect_test_harness
 
+from extrags.cores import usable_cores
+from extrags.raster import native
 from extrags.sequence import EndoscopicSequence
 from flows.outcome import SequenceOutcome
 from flows.runners import DirectRunner
@@ -62,6 +64,18 @@ def little_work() -> Iterator[None]:
     """Runs of this package are about stages and their order, not about what a phantom looks like."""
     with spared():
         yield
+
+
+@pytest.fixture(scope="package", autouse=True)
+def threads_as_users_have_them() -> Iterator[None]:
+    """The only package where runs of all stages divide their work between the cores."""
+    if not native.native_isa():
+        yield
+        return
+    before = native.num_threads()
+    native.set_num_threads(usable_cores())
+    yield
+    native.set_num_threads(before)
 
 
 @pytest.fixture(scope="package")
