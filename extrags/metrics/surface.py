@@ -201,15 +201,17 @@ def evaluate_surface(mesh: Mesh | None, truth: TrueSurface, sequence: Endoscopic
         ShapeError: while the poses are unknown.
     """
     points = sample_surface(truth.mesh, N_SAMPLES, seed=_SEED)
-    observed, unobserved = _parts(points, truth, sequence)
+    # Its tree is most of what looking at a few thousand points costs.
+    true_scene = _ray_scene(truth.mesh)
+    observed, unobserved = _parts(points, true_scene, sequence)
     found = np.zeros((0, 3))
     found_observed = found_unobserved = np.zeros(0, dtype=bool)
     to_truth = np.zeros(0)
     to_mesh = np.full(len(points), np.inf)
     if mesh is not None and _areas(mesh).sum() > 0:
         found = sample_surface(mesh, N_SAMPLES, seed=_SEED + 1)
-        to_truth, nearest = distance_to_surface(found, truth.mesh)
-        found_observed, found_unobserved = _parts(nearest, truth, sequence)
+        to_truth, nearest = _nearest(found, true_scene)
+        found_observed, found_unobserved = _parts(nearest, true_scene, sequence)
         to_mesh, _ = distance_to_surface(points, mesh)
     threshold = _threshold(sequence)
     counted = observed | unobserved
@@ -304,7 +306,13 @@ def distance_to_surface(
     points: Float[np.ndarray, "n 3"], mesh: Mesh
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
     """Distance of each point from the nearest triangle, and the nearest point on it."""
-    closest = _ray_scene(mesh).compute_closest_points(_tensor(points.astype(np.float32)))
+    return _nearest(points, _ray_scene(mesh))
+
+
+def _nearest(
+    points: Float[np.ndarray, "n 3"], scene: Any
+) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
+    closest = scene.compute_closest_points(_tensor(points.astype(np.float32)))
     nearest = closest["points"].numpy().astype(np.float64)
     return np.linalg.norm(points - nearest, axis=1), nearest
 
@@ -325,7 +333,16 @@ def seen_by(
         mask: pixels that show tissue.
         far_mm: z-depth beyond which nothing counts as seen.
     """
-    scene = _ray_scene(mesh)
+    return _seen(points, _ray_scene(mesh), cameras, mask, far_mm)
+
+
+def _seen(
+    points: Float[np.ndarray, "n 3"],
+    scene: Any,
+    cameras: Cameras,
+    mask: Bool[np.ndarray, "c h w"],
+    far_mm: float,
+) -> Bool[np.ndarray, "n"]:
     seen = np.zeros(len(points), dtype=bool)
     for index in range(len(cameras)):
         left = np.flatnonzero(~seen)
@@ -358,13 +375,13 @@ def _fused(cameras: Cameras, depth_mm: Float[np.ndarray, "c h w"]) -> Mesh:
 
 
 def _parts(
-    points: Float[np.ndarray, "n 3"], truth: TrueSurface, sequence: EndoscopicSequence
+    points: Float[np.ndarray, "n 3"], true_scene: Any, sequence: EndoscopicSequence
 ) -> tuple[Bool[np.ndarray, "n"], Bool[np.ndarray, "n"]]:
     """Which true points training cameras see, and which held-out cameras alone."""
     far = _max_fused_depth(sequence)
 
     def by(frames: np.ndarray) -> Bool[np.ndarray, "n"]:
-        return seen_by(points, truth.mesh, sequence.cameras[frames], frames_of(sequence.mask, frames), far)
+        return _seen(points, true_scene, sequence.cameras[frames], frames_of(sequence.mask, frames), far)
 
     observed = by(sequence.train)
     return observed, by(sequence.test) & ~observed
