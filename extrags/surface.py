@@ -27,7 +27,7 @@ from extrags.threads import one_torch_thread
 from extrags.unique_rows import unique_rows
 from extrags.zarr_io import new_group, open_group, read_array, write_array
 
-__all__ = ["Mesh", "fuse_depth", "fuse_surface", "rendered_depth"]
+__all__ = ["Mesh", "fuse_depth", "fuse_surface", "rendered_depth", "write_triangle_ply"]
 
 _log = logging.getLogger(__name__)
 
@@ -75,16 +75,31 @@ class Mesh(Storable):
 
     def write_ply(self, path: Path) -> None:
         """Write a binary PLY, which every mesh viewer opens."""
-        from plyfile import PlyData, PlyElement
-
         vertex = np.empty(len(self.vertices), dtype=[("x", "f4"), ("y", "f4"), ("z", "f4")])
         for axis, name in enumerate("xyz"):
             vertex[name] = self.vertices[:, axis]
-        face = np.empty(len(self.triangles), dtype=[("vertex_indices", "i4", (3,))])
-        face["vertex_indices"] = self.triangles
-        elements = [PlyElement.describe(vertex, "vertex"), PlyElement.describe(face, "face")]
-        with whole_file(path) as partial:
-            PlyData(elements, byte_order="<").write(str(partial))
+        write_triangle_ply(path, vertex, self.triangles)
+
+
+def write_triangle_ply(path: Path, vertex: np.ndarray, triangles: Int[np.ndarray, "t 3"]) -> None:
+    """Write a binary PLY of triangles, as plyfile does, which would write one triangle after the other.
+
+    Args:
+        path: of the file.
+        vertex: one row for each vertex; its fields are the properties.
+        triangles: vertex indices.
+    """
+    from plyfile import PlyData, PlyElement
+
+    described = np.empty(len(triangles), dtype=[("vertex_indices", "i4", (3,))])
+    elements = [PlyElement.describe(vertex, "vertex"), PlyElement.describe(described, "face")]
+    # In the file a list begins with its length.
+    face = np.empty(len(triangles), dtype=[("length", "u1"), ("vertex_indices", "<i4", (3,))])
+    face["length"], face["vertex_indices"] = 3, triangles
+    with whole_file(path) as partial, partial.open("wb") as file:
+        file.write(PlyData(elements, byte_order="<").header.encode("ascii") + b"\n")
+        file.write(vertex.astype(vertex.dtype.newbyteorder("<")).tobytes())
+        file.write(face.tobytes())
 
 
 @one_torch_thread()

@@ -15,6 +15,7 @@ from jaxtyping import UInt8
 from extrags.errors import ConfigError
 from extrags.export.textured import ColoredMesh
 from extrags.output_files import whole_file, write_file
+from extrags.surface import write_triangle_ply
 
 __all__ = ["MESH_FORMATS", "write_mesh"]
 
@@ -61,8 +62,6 @@ def write_mesh(colored: ColoredMesh, path: Path, *, metric: bool = True) -> tupl
 
 
 def _write_ply(colored: ColoredMesh, path: Path) -> None:
-    from plyfile import PlyData, PlyElement
-
     mesh = colored.mesh
     vertex = np.empty(
         len(mesh.vertices),
@@ -75,11 +74,7 @@ def _write_ply(colored: ColoredMesh, path: Path) -> None:
     for index, name in enumerate(("red", "green", "blue")):
         vertex[name] = colored.colors[:, index]
     vertex["invented"] = colored.invented
-    face = np.empty(len(mesh.triangles), dtype=[("vertex_indices", "i4", (3,))])
-    face["vertex_indices"] = mesh.triangles
-    elements = [PlyElement.describe(vertex, "vertex"), PlyElement.describe(face, "face")]
-    with whole_file(path) as partial:
-        PlyData(elements, byte_order="<").write(str(partial))
+    write_triangle_ply(path, vertex, mesh.triangles)
 
 
 def _write_obj(colored: ColoredMesh, path: Path) -> tuple[Path, ...]:

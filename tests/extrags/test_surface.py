@@ -198,6 +198,8 @@ class TestMesh:
         read = PlyData.read(str(tmp_path / "mesh.ply"))
         np.testing.assert_array_equal(read["vertex"]["y"], mesh.vertices[:, 1])
         np.testing.assert_array_equal(np.vstack(read["face"]["vertex_indices"]), mesh.triangles)
+        read.write(str(tmp_path / "again.ply"))
+        assert (tmp_path / "mesh.ply").read_bytes() == (tmp_path / "again.ply").read_bytes()
 
         import open3d as o3d
 
