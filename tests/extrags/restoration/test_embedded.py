@@ -446,6 +446,8 @@ class TestEmbedded:
             "pretrained_weights": str(tmp_path),
             "judge_pairs": most,
             "folds": 2,
+            # How many pairs there are does not depend on how good their folds are.
+            "fold_iterations": 20,
         }
         train_enhancer(tube.scene, tube.sequence, SMALL.model_copy(update=settings), CoarseConfig())
         (pairs,) = judged

@@ -78,8 +78,10 @@ class TestAnotherScale:
     @pytest.mark.parametrize(
         ("scale", "depth"),
         [
-            *((scale, True) for scale in (0.001, 0.5, 1.2, 2.0, 20.0, 1000.0)),
-            *((scale, False) for scale in (0.01, 0.5, 2.0, 20.0)),
+            *((scale, True) for scale in (0.001, 0.5, 1.2, 1000.0)),
+            *((scale, False) for scale in (0.01, 2.0)),
+            *(pytest.param(scale, True, marks=pytest.mark.slow) for scale in (2.0, 20.0)),
+            *(pytest.param(scale, False, marks=pytest.mark.slow) for scale in (0.5, 20.0)),
         ],
     )
     def test_is_refused_with_the_right_one(
@@ -93,7 +95,7 @@ class TestAnotherScale:
         assert named == pytest.approx(1, abs=0.02)
         imported(scene, sequence, named, tmp_path)
 
-    @pytest.mark.parametrize("scale", [0.01, 30.0])
+    @pytest.mark.parametrize("scale", [pytest.param(0.01, marks=pytest.mark.slow), 30.0])
     def test_with_the_light_kept(self, scale: float, tube: Tube, tmp_path: Path) -> None:
         with pytest.raises(SourceError) as error:
             imported(tube.scene, frames_of(tube.scene, tube.sequence), scale, tmp_path)
@@ -127,9 +129,16 @@ class TestAnotherScale:
 
 
 class TestNoScale:
-    @pytest.mark.parametrize("depth", [True, False])
     @pytest.mark.parametrize(
-        ("axis", "angle_deg"), [((1.0, 0, 0), 90), ((1.0, 0, 0), 180), ((0, 1.0, 0), 90)]
+        ("axis", "angle_deg", "depth"),
+        [
+            ((1.0, 0, 0), 90, True),
+            ((1.0, 0, 0), 180, False),
+            ((0, 1.0, 0), 90, False),
+            pytest.param((1.0, 0, 0), 90, False, marks=pytest.mark.slow),
+            pytest.param((1.0, 0, 0), 180, True, marks=pytest.mark.slow),
+            pytest.param((0, 1.0, 0), 90, True, marks=pytest.mark.slow),
+        ],
     )
     def test_other_axes(
         self,
