@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -112,3 +113,18 @@ def test_custom_metric() -> None:
         unregister_metric(module.CHROMA_ERROR.key)
     assert 0 < result.metrics["chroma_error"] < 0.2
     assert 0 < result.metrics["aligned"]["chroma_error"] < 0.2
+
+
+def test_custom_metric_where_nobody_knows_what_was_observed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of frames with poses alone it ended in a traceback, after the reconstruction."""
+    module = example("custom_metric")
+    plain = replace(extrags.read(SEQUENCE, FAST.ingest), depth_mm=None, observed=None)
+    monkeypatch.setattr(module.extrags, "read", lambda *_: plain)
+    extrags.register_metric(module.CHROMA_ERROR)
+    try:
+        module.evaluated("frames with poses", FAST)
+    finally:
+        unregister_metric(module.CHROMA_ERROR.key)
+    assert "observed surface" not in capsys.readouterr().out
