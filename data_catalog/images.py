@@ -32,8 +32,10 @@ __all__ = [
     "read_color",
     "read_depth",
     "read_mask",
+    "read_upright",
     "save_images",
     "spread",
+    "upright_size",
 ]
 
 BITS_PER_SAMPLE = 258
@@ -45,6 +47,10 @@ _ORIENTATION = 274
 """Tag of EXIF."""
 UPRIGHT = 1
 """Orientation of images whose pixels lie as they are shown."""
+_ON_THEIR_SIDES = (5, 6, 7, 8)
+"""Orientations whose rows are shown as columns; of what that makes of them, the next two are turned round."""
+_LEFT_IS_RIGHT = (2, 3, 6, 7)
+_TOP_IS_BOTTOM = (3, 4, 7, 8)
 _TIFF_SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 DEPTH_SUFFIXES = (".npy", ".tiff", ".tif", ".png")
 _MASK_THRESHOLD = 127
@@ -137,6 +143,35 @@ def image_size(file: Path, *, frame: object = None) -> tuple[int, int]:
         return image.size
 
 
+def read_upright(file: Path, *, frame: object = None) -> UInt8[np.ndarray, "h w 3"]:
+    """As `read_color`, turned and mirrored as viewers show the image (`orientation`).
+
+    Raises:
+        SourceNotFoundError: there is no such file.
+        SourceError: as of `read_color`.
+    """
+    image = read_color(file, frame=frame)
+    stored = orientation(file)
+    if stored in _ON_THEIR_SIDES:
+        image = image.transpose(1, 0, 2)
+    if stored in _LEFT_IS_RIGHT:
+        image = image[:, ::-1]
+    if stored in _TOP_IS_BOTTOM:
+        image = image[::-1]
+    return np.ascontiguousarray(image)
+
+
+def upright_size(file: Path, *, frame: object = None) -> tuple[int, int]:
+    """Width and height in pixels of what `read_upright` gives, from the first bytes.
+
+    Raises:
+        SourceNotFoundError: there is no such file.
+        SourceError: the file is no image.
+    """
+    width, height = image_size(file, frame=frame)
+    return (height, width) if orientation(file) in _ON_THEIR_SIDES else (width, height)
+
+
 def bits_per_value(file: Path) -> int:
     """Bits of each colour or grey value in an image file; 8 for what is no image.
 
@@ -159,8 +194,9 @@ def bits_per_value(file: Path) -> int:
 def orientation(file: Path) -> int:
     """How viewers turn an image that `read_color` has read: EXIF's 1 to 8, `UPRIGHT` where nothing says so.
 
-    COLMAP and instant-ngp take pixels as they are stored, and so does `read_color`; OpenCV turns them. Of a
-    TIFF, the orientation is part of its layout: Pillow has applied it, and nothing is left to turn.
+    COLMAP and instant-ngp take pixels as they are stored, and so does `read_color`; OpenCV turns them, as
+    `read_upright` does. Of a TIFF, the orientation is part of its layout: Pillow has applied it, and nothing
+    is left to turn.
     """
     from PIL import Image
 
@@ -174,7 +210,7 @@ def orientation(file: Path) -> int:
                 return UPRIGHT
             found = image.getexif().get(_ORIENTATION, UPRIGHT)
     except SourceError:
-        # The pixels were read: what is damaged is what describes them, and that says nothing.
+        # Reading the pixels tells what is damaged; where only what describes them is, that says nothing.
         return UPRIGHT
     return found if found in range(1, 9) else UPRIGHT
 

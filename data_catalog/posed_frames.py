@@ -139,6 +139,8 @@ class SourceFrames:
         lens_stays: why no calibration file may take the place of the lenses that are stated, as a sentence;
             None where one may.
         stereo_camera: whose frames these are; None where nothing tells of two cameras.
+        upright: whether `read_color` turns images as viewers do (EXIF orientation); lenses and masks are then
+            those of the turned ones.
     """
 
     frames: Sequence[PosedFrame]
@@ -163,6 +165,7 @@ class SourceFrames:
     looked_at: int = 0
     lens_stays: str | None = None
     stereo_camera: StereoCamera | None = None
+    upright: bool = False
 
 
 def assembled(source: SourceFrames, config: IngestConfig, name: str) -> EndoscopicSequence:
@@ -180,12 +183,13 @@ def assembled(source: SourceFrames, config: IngestConfig, name: str) -> Endoscop
         ConfigError: a size that the source cannot give.
     """
     kept, split, world_from_camera = chosen_frames(source, config)
+    # Before a size is refused that this explains.
+    _tell_about_orientation(kept, upright=source.upright)
     pixels = _Pixels(source, config, kept)
     for index, frame in enumerate(kept, start=source.looked_at + 1):
         pixels.read(frame)
         emit(Progress("ingest", index, source.looked_at + len(kept)))
     pixels.tell(kept)
-    _tell_about_orientation(kept)
     tell_about_pages(kept[0].file)
     K = np.stack([pixels.samplings[frame.lens].K for frame in kept])
     rgb, mask = pixels.colors.array, pixels.masks(kept)
@@ -393,15 +397,22 @@ class _Pixels:
         return self._last_mask[2]
 
 
-def _tell_about_orientation(frames: Sequence[PosedFrame]) -> None:
+def _tell_about_orientation(frames: Sequence[PosedFrame], *, upright: bool) -> None:
     turned = [frame for frame in frames if orientation(frame.file) != UPRIGHT]
     if turned:
+        done = (
+            "and are read upright, as viewers show them; a mask, intrinsics and a calibration have to belong "
+            "to upright pixels"
+            if upright
+            else "which turns them in viewers, and are read as they are stored, as by COLMAP; masks, depth, "
+            "intrinsics and poses have to belong to stored pixels"
+        )
         logger.warning(
-            "%s: %d of %d images, this one first, are turned by viewers (EXIF orientation), and read as they "
-            "are stored, as by COLMAP; masks, depth, intrinsics and poses have to belong to stored pixels",
+            "%s: %d of %d images, this one first, have an EXIF orientation, %s",
             turned[0].file,
             len(turned),
             len(frames),
+            done,
         )
 
 

@@ -4,12 +4,15 @@ Images lie in the folder itself, or in `images/` or `rgb/` below it, and are tak
 numbers in their names: 9 before 10, decimals by their values (`extrags.frame_names`). Where several of
 these hold images, those of the one with at least twice as many as any other are taken, and the others named
 in a warning; without such a one the source is refused. Woven (interlaced) images are read as they are, with
-a warning. Of a stereo endoscope the frames of one camera are read (`data_catalog.readers.stereo_frames`).
+a warning. Images with an EXIF orientation are turned upright, as viewers show them, with a warning: nothing
+that is read beside them, such as poses, holds for stored pixels. Of a stereo endoscope the frames of one
+camera are read (`data_catalog.readers.stereo_frames`).
 What is depth or a mask of a frame by its name is left out, and what tells of poses is not read, both with a
 warning (`data_catalog.readers.beside_frames`).
 
 Optional beside them: `intrinsics.json` with `K` (3 x 3), or `fx`, `fy`, `cx`, `cy`, or `field_of_view_deg`
-(horizontal), in pixels of the files with centres at +0.5, of a pinhole; and `mask.png` (white is tissue).
+(horizontal), in pixels of the upright images with centres at +0.5, of a pinhole; and `mask.png` (white is
+tissue), of upright images too.
 Without intrinsics a horizontal field of view of 90 degrees is assumed, and said so in the log: the sequence's
 intrinsics are `guessed`, and the poses stage estimates them, lens distortion included. A calibration file
 (`ingest.calibration`) takes the place of both, and `intrinsics.json` is then not read. Without a mask, the
@@ -33,11 +36,13 @@ from data_catalog.folder_reader import FolderReader
 from data_catalog.footage import DICOM_SUFFIXES, VIDEO_SUFFIXES, files_of_kind
 from data_catalog.guessed_intrinsics import ASSUMED_FIELD_OF_VIEW_DEG, intrinsics_of_field_of_view
 from data_catalog.images import (
+    UPRIGHT,
     check_links,
     image_entries,
-    image_size,
-    read_color,
+    orientation,
+    read_upright,
     spread,
+    upright_size,
 )
 from data_catalog.interlacing import is_combed, is_interlaced
 from data_catalog.lens_entries import check_pinhole
@@ -228,12 +233,19 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     files = read.files
     tell_about_order(files[0].parent, NameOrder(file.name for file in files))
     views = None if read.pairs else views_in_pictures(files, config.stereo_camera)
-    width, height = image_size(files[0], frame=files[0].name)
+    width, height = upright_size(files[0], frame=files[0].name)
     pixel_aspect = 1.0
     if views is not None:
         pixel_aspect = views.pixel_aspect(width, height)
         width, height = views.size(width, height)
-    K = read_intrinsics(folder, width, height, pixel_aspect=pixel_aspect, is_used=config.calibration is None)
+    K = read_intrinsics(
+        folder,
+        width,
+        height,
+        pixel_aspect=pixel_aspect,
+        is_used=config.calibration is None,
+        are_turned=orientation(files[0]) != UPRIGHT,
+    )
     lens = Lens.pinhole(K, width, height)
     mask_file = mask_beside(folder, files[0].parent)
     return SourceFrames(
@@ -244,6 +256,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
         masks=_ContentMask(),
         intrinsics=stated_intrinsics(folder, config),
         stereo_camera=config.stereo_camera if read.pairs or views is not None else None,
+        upright=True,
     )
 
 
@@ -264,8 +277,8 @@ class _Images:
         self._combed: list[bool] = []
 
     def image(self, frame: PosedFrame) -> UInt8[np.ndarray, "h w 3"]:
-        """The image of the next frame, as it lies on disk."""
-        image = read_color(frame.file, frame=frame.label)
+        """The image of the next frame, as viewers show it."""
+        image = read_upright(frame.file, frame=frame.label)
         if self._views is not None:
             image = self._views.view(image)
         if frame.file in self._looked_at:
@@ -313,7 +326,7 @@ def _order(folder: Path) -> dict[str, Any]:
 
 READER = FolderReader(
     name="frames",
-    version=8,
+    version=9,
     summary="plain images in the folder, in images/ or in rgb/, optionally with intrinsics.json and mask.png",
     recognises=_recognises,
     files=_files,
@@ -330,7 +343,13 @@ def stated_intrinsics(folder: Path, config: IngestConfig) -> Literal["given", "g
 
 
 def read_intrinsics(
-    folder: Path, width: int, height: int, *, pixel_aspect: float = 1.0, is_used: bool = True
+    folder: Path,
+    width: int,
+    height: int,
+    *,
+    pixel_aspect: float = 1.0,
+    is_used: bool = True,
+    are_turned: bool = False,
 ) -> Float[np.ndarray, "3 3"]:
     """K from `intrinsics.json` in a folder, or of the assumed field of view where there is none.
 
@@ -341,6 +360,7 @@ def read_intrinsics(
         pixel_aspect: width of a pixel over its height, for intrinsics from a field of view.
         is_used: false where a calibration file takes the place of the result: nothing is read then, nor
             warned of.
+        are_turned: whether width and height are those of images that lie otherwise in their files.
 
     Raises:
         SourceError: the file is damaged or describes no pinhole.
@@ -363,7 +383,7 @@ def read_intrinsics(
         content = json.loads(file.read_text(encoding="utf-8-sig"))
         if not isinstance(content, dict):
             raise TypeError(f"found {type(content).__name__}, not an object")
-        _check_described(content, width, height, file)
+        _check_described(content, width, height, file, are_turned=are_turned)
         if "K" in content:
             K = np.asarray(content["K"], dtype=np.float64)
         elif "field_of_view_deg" in content:
@@ -409,7 +429,9 @@ def _number(content: dict[str, Any], key: str, file: Path) -> float:
         raise SourceError(f"{json.dumps(content[key])}; expected a number", file=file, field=key) from error
 
 
-def _check_described(content: dict[str, Any], width: int, height: int, file: Path) -> None:
+def _check_described(
+    content: dict[str, Any], width: int, height: int, file: Path, *, are_turned: bool
+) -> None:
     """Refuse what would otherwise be passed over: a lens that is no pinhole, and another size.
 
     Raises:
@@ -420,8 +442,9 @@ def _check_described(content: dict[str, Any], width: int, height: int, file: Pat
     for names in _SIZES:
         told = [content.get(name) for name in names]
         if None not in told and told != [width, height]:
+            as_shown = " once they are turned upright (EXIF orientation)" if are_turned else ""
             raise SourceError(
-                f"for images of {told[0]} x {told[1]} pixels; found {width} x {height}",
+                f"for images of {told[0]} x {told[1]} pixels; found {width} x {height}{as_shown}",
                 file=file,
                 field=names[0],
             )

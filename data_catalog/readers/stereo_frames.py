@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from data_catalog.images import image_entries, image_size, read_color, spread
+from data_catalog.images import image_entries, read_upright, spread, upright_size
 from data_catalog.readers.beside_frames import is_of_another_kind, listed_files
 from data_catalog.stereo import (
     AGREES,
@@ -190,7 +190,7 @@ def _numbers(file: Path) -> tuple[str, ...]:
 def _pictures(pairs: list[tuple[Path, Path]]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     for k in spread(len(pairs), _LOOKED_AT):
         first, second = pairs[k]
-        yield read_color(first, frame=first.name), read_color(second, frame=second.name)
+        yield read_upright(first, frame=first.name), read_upright(second, frame=second.name)
 
 
 def views_in_pictures(files: list[Path], camera: StereoCamera) -> BothViews | None:
@@ -204,9 +204,9 @@ def views_in_pictures(files: list[Path], camera: StereoCamera) -> BothViews | No
         SourceError: a picture that is damaged.
     """
     folder = files[0].parent
-    size = image_size(files[0], frame=files[0].name)
+    size = upright_size(files[0], frame=files[0].name)
     views = possible_views(f"{folder.name} {files[0].stem}", *size, camera)
     if views is None:
         return None
-    pictures = (read_color(files[k], frame=files[k].name) for k in spread(len(files), _LOOKED_AT))
+    pictures = (read_upright(files[k], frame=files[k].name) for k in spread(len(files), _LOOKED_AT))
     return views if views.is_told(folder, agreeing_share(views.both(pictures))) else None

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageOps
 
 from data_catalog.image_pages import pages_in
 from data_catalog.images import (
@@ -18,7 +18,9 @@ from data_catalog.images import (
     read_color,
     read_depth,
     read_mask,
+    read_upright,
     spread,
+    upright_size,
 )
 from extrags.errors import SourceError
 
@@ -77,6 +79,20 @@ class TestOrientation:
         assert orientation(file) == UPRIGHT
         (tmp_path / "a.mp4").write_bytes(b"no image")
         assert orientation(tmp_path / "a.mp4") == UPRIGHT
+
+    @pytest.mark.parametrize("tag", range(1, 9))
+    def test_upright_is_what_viewers_show(self, tmp_path: Path, tag: int) -> None:
+        file = self.tagged(tmp_path / "a.png", tag)
+        with Image.open(file) as image:
+            shown = ImageOps.exif_transpose(image)
+        np.testing.assert_array_equal(read_upright(file), np.asarray(shown))
+        np.testing.assert_array_equal(read_upright(file), cv2.imread(str(file))[..., ::-1])
+        assert upright_size(file) == shown.size
+
+    def test_a_tiff_is_not_turned_twice(self, tmp_path: Path) -> None:
+        file = self.tagged(tmp_path / "a.tif")
+        np.testing.assert_array_equal(read_upright(file), read_color(file))
+        assert upright_size(file) == (20, 30)
 
     @staticmethod
     def tagged(file: Path, tag: int | None = 6) -> Path:

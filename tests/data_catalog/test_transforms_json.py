@@ -243,7 +243,7 @@ class TestReading:
         for file in sorted((folder / "images").iterdir())[3:5]:
             Image.open(file).save(file, exif=exif)
         np.testing.assert_array_equal(read(folder).rgb, before.rgb)
-        assert "0003.png: 2 of 10 images, this one first, are turned by viewers" in caplog.text
+        assert "0003.png: 2 of 10 images, this one first, have an EXIF orientation, which t" in caplog.text
 
     def test_paths_without_suffix(self, folder, edit) -> None:
         def strip(content) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import pytest
 from PIL import Image
 
 from data_catalog.catalog import read, resolve, source_fingerprint
-from data_catalog.images import color_files, read_color
+from data_catalog.images import color_files, read_upright
 from data_catalog.inspection import inspect
 from data_catalog.readers import frames_folder
 from extrags.config import IngestConfig
@@ -119,6 +120,44 @@ class TestVideos:
             resolve(exam.parent)
 
 
+class TestOrientation:
+    """Of a camera that was turned, frames lay on their sides, and those of both ways were refused."""
+
+    LEFT = 8
+    """EXIF's word for pixels that viewers turn by 90 degrees against the clock."""
+
+    def turned(self, folder: Path, *, every: int = 1) -> None:
+        exif = Image.Exif()
+        exif[274] = self.LEFT
+        write_frames(folder, 8)
+        for file in sorted(folder.glob("*.png"))[::every]:
+            with Image.open(file) as image:
+                stored = image.transpose(Image.Transpose.ROTATE_270)
+            stored.save(file, exif=exif)
+
+    @pytest.mark.parametrize("every", [1, 3])
+    def test_frames_are_read_as_viewers_show_them(self, tmp_path, every, caplog) -> None:
+        write_frames(tmp_path / "upright", 8)
+        self.turned(tmp_path / "turned", every=every)
+        upright, found = read(tmp_path / "upright"), read(tmp_path / "turned")
+        np.testing.assert_array_equal(found.rgb, upright.rgb)
+        np.testing.assert_array_equal(found.K, upright.K)
+        told = [record.getMessage() for record in caplog.records if "EXIF" in record.getMessage()]
+        assert len(told) == 1
+        assert f"0000.png: {len(range(0, 8, every))} of 8 images, this one first, have an EXIF" in told[0]
+        assert "read upright" in told[0]
+
+    def test_what_lies_beside_them_is_of_the_upright_picture(self, tmp_path) -> None:
+        self.turned(tmp_path)
+        K = [[40, 0, 24], [0, 40, 21], [0, 0, 1]]
+        (tmp_path / "intrinsics.json").write_text(json.dumps({"K": K, "width": 48, "height": 42}))
+        Image.fromarray(np.full((42, 48), 255, np.uint8)).save(tmp_path / "mask.png")
+        np.testing.assert_array_equal(read(tmp_path).K[0], K)
+        (tmp_path / "intrinsics.json").write_text(json.dumps({"K": K, "width": 42, "height": 48}))
+        with pytest.raises(SourceError, match=r"field width: .* 42 x 48 .*; found 48 x 42 once they are tur"):
+            read(tmp_path)
+
+
 def test_woven_frames_are_told(tmp_path) -> None:
     for number, image in enumerate(interlaced(moving_scene(8, 320, 240, speed=8))):
         Image.fromarray(image).save(tmp_path / f"{number}.png")
@@ -158,9 +197,9 @@ def test_each_frame_that_is_kept_is_decoded_once_and_no_other(tmp_path, monkeypa
 
     def noted(file: Path, *, frame: object = None) -> np.ndarray:
         decoded.append(file.name)
-        return read_color(file, frame=frame)
+        return read_upright(file, frame=frame)
 
-    monkeypatch.setattr(frames_folder, "read_color", noted)
+    monkeypatch.setattr(frames_folder, "read_upright", noted)
     assert read(tmp_path, IngestConfig(max_frames=4)).frame_names == ("0000", "0005", "0010", "0015")
     assert decoded == ["0000.png", "0005.png", "0010.png", "0015.png"]
 
