@@ -12,6 +12,8 @@ __all__ = ["another_size", "unlikely"]
 _ALIKE = 0.1
 """Both coordinates of a principal point are as far off, to this share of the image's half."""
 _LARGER, _SMALLER = 1.4, 0.7
+_ON_ITS_SIDE = 0.02
+"""A principal point is so near, in shares of the image's sides, to the centre of the image on its side."""
 _SQUEEZED = 1.15
 _WIDEST_DEG, _NARROWEST_DEG = 150, 15
 
@@ -34,6 +36,12 @@ def unlikely(K: Float[np.ndarray, "3 3"], width: int, height: int) -> str | None
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     if (problem := another_size(K, width, height)) is not None:
         return problem
+    if _is_of_turned(cx, cy, width, height):
+        return (
+            f"the principal point ({cx:.1f}, {cy:.1f}) is the centre of an image of {height} x {width} "
+            f"pixels, and this one has {width} x {height}: K belongs to the image before or after a quarter "
+            "turn. Exchange fx and fy, and give the principal point of the image that is read"
+        )
     if abs(cx - width / 2) > OFF_CENTRE_SHARE * width or abs(cy - height / 2) > OFF_CENTRE_SHARE * height:
         return (
             f"the principal point ({cx:.1f}, {cy:.1f}) lies far from the centre of {width} x {height} "
@@ -51,3 +59,9 @@ def unlikely(K: Float[np.ndarray, "3 3"], width: int, height: int) -> str | None
             "endoscopes have 40 to 140 as a pinhole. Does fx belong to another image size?"
         )
     return None
+
+
+def _is_of_turned(cx: float, cy: float, width: int, height: int) -> bool:
+    """Whether a principal point is the centre of the image after a quarter turn, and not of the image."""
+    near = abs(2 * cx - height) < _ON_ITS_SIDE * height and abs(2 * cy - width) < _ON_ITS_SIDE * width
+    return near and abs(width - height) > 4 * _ON_ITS_SIDE * max(width, height)

@@ -191,6 +191,16 @@ class TestLens:
         assert not [finding for finding in found.findings if finding.topic == "lens"]
 
 
+def test_intrinsics_of_the_picture_on_its_side_are_told(clip) -> None:
+    assert "intrinsics" not in [finding.topic for finding in diagnose(clip, "here")]
+    K = clip.K.copy()
+    K[:, 0, 2], K[:, 1, 2] = clip.height / 2, clip.width / 2
+    found = [finding for finding in diagnose(replace(clip, K=K), "here") if finding.topic == "intrinsics"]
+    assert len(found) == 1
+    told = f"is the centre of an image of {clip.height} x {clip.width} pixels, and this one has {clip.width}"
+    assert told in found[0].sentence
+
+
 def test_memory_does_not_grow_with_the_frames(clip) -> None:
     """What is made of all frames at once would be as large as they are."""
     peaks = []
