@@ -23,6 +23,7 @@ from data_catalog.folder_reader import Glance
 from data_catalog.folders import FolderDataset, find_reader
 from data_catalog.footage import DICOM_SUFFIXES, VIDEO_SUFFIXES
 from data_catalog.phantom.dataset import PHANTOM
+from data_catalog.pose_conventions import OPENCV
 from data_catalog.specular import with_specular
 from data_catalog.stereo import check_one_camera
 from extrags.arguments import check_settings_argument
@@ -150,7 +151,9 @@ def read(source: Source | str | Path, config: IngestConfig | None = None) -> End
     _check_time_span(source, config)
     detail = source_detail(dataset, source, config)
     sequence = dataset.read(source, config if detail is None else detail.applied_to(config))
-    check_sequence(sequence, file=source.path or source.name)
+    reader = find_reader(source.format)
+    stored = OPENCV if reader is None else reader.poses
+    check_sequence(sequence, file=source.path or source.name, stored=stored)
     if config.scale_mm_per_unit is not None:
         sequence = _scaled(sequence, config.scale_mm_per_unit)
     # After the checks, which hold poses against all depth there is; what was observed is known by now.

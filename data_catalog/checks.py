@@ -9,21 +9,19 @@ what takes several frames. What is readable but questionable is reported by `dat
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from data_catalog.plausible_intrinsics import another_size
+from data_catalog.pose_conventions import OPENCV, USUAL_MISTAKES, PoseConvention, other_readings
 from extrags.cameras import invert_poses, project_points, transform_points, unproject_pixels
 from extrags.errors import PoseError, SourceError
 from extrags.sequence import EndoscopicSequence
 from extrags.sequence_checks import check_arrays, check_depth, check_intrinsics, check_pose
 
 __all__ = [
-    "USUAL_MISTAKES",
     "check_axes",
     "check_depth",
     "check_depth_scale",
@@ -32,11 +30,8 @@ __all__ = [
     "check_sequence",
     "depth_disagreement",
     "neighbouring_frames",
-    "other_readings",
 ]
 
-USUAL_MISTAKES = 3
-"""How many of `other_readings`, the first ones, are mistakes that people make."""
 # Below this depth re-projection error (relative, median) poses are right. Another reading of the axes is
 # named as the likely mistake when its error is small, and a small share of the error as given. Where cameras
 # move little, some of 48 readings fits better than the right one by chance.
@@ -67,12 +62,15 @@ _KNOWN_FACTORS = {
 }
 
 
-def check_sequence(sequence: EndoscopicSequence, *, file: object = None) -> None:
+def check_sequence(
+    sequence: EndoscopicSequence, *, file: object = None, stored: PoseConvention = OPENCV
+) -> None:
     """Refuse a sequence that no stage could use.
 
     Args:
         sequence: what a reader made.
         file: named in errors.
+        stored: how the file should hold poses, for errors about them.
 
     Raises:
         PoseError: a pose that is not a rigid motion, or axes or positions that the depth contradicts.
@@ -83,17 +81,17 @@ def check_sequence(sequence: EndoscopicSequence, *, file: object = None) -> None
     check_arrays(sequence, file=file)
     if sequence.depth_mm is not None and not any((depth > 0).any() for depth in sequence.depth_mm):
         raise SourceError("no pixel of any frame has a depth", file=file, field="depth_mm")
-    check_axes(sequence, file=file)
+    check_axes(sequence, file=file, stored=stored)
     check_depth_scale(sequence, file=file)
 
 
-def check_axes(sequence: EndoscopicSequence, *, file: object = None) -> None:
+def check_axes(sequence: EndoscopicSequence, *, file: object = None, stored: PoseConvention = OPENCV) -> None:
     """Refuse poses in other axes than OpenCV's camera-to-world, where depth can tell.
 
     Depth of one frame, carried to the next one by their poses, must meet that frame's depth. Where it does
     not, every other reading of the axes (24 proper ones, and the inverse) is tried; one that fits much
-    better is named in the message, the usual mistakes before all others. Without depth, or with hardly any
-    motion, nothing can be told.
+    better is named in the message, the usual mistakes before all others, in the words of the file (`stored`).
+    Without depth, or with hardly any motion, nothing can be told.
 
     Raises:
         PoseError: another reading of the axes fits the depth much better.
@@ -111,7 +109,10 @@ def check_axes(sequence: EndoscopicSequence, *, file: object = None) -> None:
     if as_given < _SUSPICIOUS_ERROR:
         return
     _refuse_intrinsics_of_another_size(sequence, as_given, file)
-    fits = [(_reprojection_error(sequence, read, pairs, seen), name) for name, read in other_readings(poses)]
+    fits = [
+        (_reprojection_error(sequence, read, pairs, seen), name)
+        for name, read in other_readings(poses, stored)
+    ]
     best_error, _ = min(fits)
     # Along a narrow part of the image another reading fits by chance, though not as well as the right one.
     convincing = _CONVINCING_ERROR if _are_wide(sequence, pairs) else _SUSPICIOUS_ERROR
@@ -123,7 +124,7 @@ def check_axes(sequence: EndoscopicSequence, *, file: object = None) -> None:
         raise PoseError(
             f"the poses contradict the depth: carried from frame to frame it is off by {as_given:.0%} "
             f"(median), but only by {error:.1%} when the poses are read as {name}. "
-            "Expected OpenCV axes (x right, y down, z forward), camera to world",
+            f"Expected {stored.expected}",
             file=file,
             field="world_from_camera",
         )
@@ -356,53 +357,3 @@ def _checked_pixels(
         stride = max(1, int(stride * np.sqrt(max(share, _MIN_COMPARED_SHARE))))
     v, u = np.mgrid[stride // 2 : height : stride, stride // 2 : width : stride]
     return v.ravel(), u.ravel()
-
-
-def other_readings(poses: Float[np.ndarray, "f 4 4"]) -> Iterator[tuple[str, Float[np.ndarray, "f 4 4"]]]:
-    """Poses as they may have been meant, each with the name of that reading; all but the given one.
-
-    The usual mistakes come first: world-to-camera, OpenGL axes, and both. Then all other rotations that map
-    axes to axes, and their inverses.
-    """
-    open_gl, open_cv = np.diag([1.0, -1.0, -1.0]), np.eye(3)
-    usual = [(open_cv, True), (open_gl, False), (open_gl, True)]
-    known = [*usual, (open_cv, False)]
-    others = [
-        (axes, inverted)
-        for axes in _axis_rotations()
-        for inverted in (False, True)
-        if not any(inverted == way and np.array_equal(axes, other) for other, way in known)
-    ]
-    inverses = invert_poses(poses)
-    for axes, inverted in [*usual, *others]:
-        turn = np.eye(4)
-        turn[:3, :3] = axes
-        yield _reading_name(axes, inverted), (inverses if inverted else poses) @ turn
-
-
-def _axis_rotations() -> list[Float[np.ndarray, "3 3"]]:
-    """The 24 rotations that map axes to axes; OpenGL's flip of y and z is one of them."""
-    readings = []
-    for order in itertools.permutations(range(3)):
-        for signs in itertools.product((1.0, -1.0), repeat=3):
-            matrix = np.zeros((3, 3))
-            matrix[list(order), range(3)] = signs
-            if np.linalg.det(matrix) > 0:
-                readings.append(matrix)
-    return readings
-
-
-def _reading_name(axes: Float[np.ndarray, "3 3"], inverted: bool) -> str:
-    """What a user calls a reading."""
-    letters = "xyz"
-    parts = []
-    for k in range(3):
-        source = int(np.argmax(np.abs(axes[:, k])))
-        parts.append(("" if axes[source, k] > 0 else "-") + letters[source])
-    if np.array_equal(axes, np.diag([1.0, -1.0, -1.0])):
-        name = "OpenGL axes (y up, z backward: columns y and z negated)"
-    elif np.array_equal(axes, np.eye(3)):
-        name = "OpenCV axes"
-    else:
-        name = f"axes ({', '.join(parts)})"
-    return f"world-to-camera (inverted), {name}" if inverted else name

@@ -11,15 +11,17 @@ import itertools
 from collections.abc import Callable, Iterator
 from decimal import Decimal
 from fractions import Fraction
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float
 
-from data_catalog.checks import USUAL_MISTAKES, depth_disagreement, other_readings
+from data_catalog.checks import depth_disagreement
 from data_catalog.findings import Finding, warning
 from data_catalog.mask_findings import mask_findings
 from data_catalog.matches import match_neighbours, pose_support
 from data_catalog.plausible_intrinsics import unlikely
+from data_catalog.pose_conventions import OPENCV, USUAL_MISTAKES, PoseConvention, other_readings
 from extrags.cameras import Cameras, rotation_angle_deg
 from extrags.frame_names import NameOrder, is_gap, usual_step
 from extrags.frame_quantiles import median_of_frames
@@ -45,7 +47,9 @@ _BLACK = 4.0
 _DISAGREEMENT = 0.05
 
 
-def diagnose(sequence: EndoscopicSequence, file: str, *, thinned: bool = False) -> list[Finding]:
+def diagnose(
+    sequence: EndoscopicSequence, file: str, *, thinned: bool = False, stored: PoseConvention = OPENCV
+) -> list[Finding]:
     """Everything questionable about a sequence.
 
     Frames are looked at one after another: of long recordings they do not fit into memory together.
@@ -54,9 +58,11 @@ def diagnose(sequence: EndoscopicSequence, file: str, *, thinned: bool = False) 
         sequence: as a reader made it.
         file: the source, named in findings.
         thinned: whether frames were left out on purpose, so that gaps in their numbering tell nothing.
+        stored: how the file should hold poses, for findings about them.
     """
     found: list[Finding] = []
-    for check in _CHECKS if thinned else (_missing, *_CHECKS):
+    checks = (*(() if thinned else (_missing,)), *_CHECKS, partial(_points, stored=stored))
+    for check in (*checks, partial(_epipolar, stored=stored), _disagreement, _depth):
         found += [finding.model_copy(update={"file": file}) for finding in check(sequence)]
     return found
 
@@ -306,7 +312,7 @@ def _pose_steps(sequence: EndoscopicSequence, members: list[int]) -> Iterator[Fi
         )
 
 
-def _points(sequence: EndoscopicSequence) -> Iterator[Finding]:
+def _points(sequence: EndoscopicSequence, stored: PoseConvention) -> Iterator[Finding]:
     """Sparse points that no camera sees."""
     if sequence.points is None or sequence.world_from_camera is None or len(sequence.points) < 20:
         return
@@ -314,7 +320,7 @@ def _points(sequence: EndoscopicSequence) -> Iterator[Finding]:
     as_given = _seen_share(sequence, poses)
     if as_given > 0.15:
         return
-    shares = [(_seen_share(sequence, read), name) for name, read in other_readings(poses)]
+    shares = [(_seen_share(sequence, read), name) for name, read in other_readings(poses, stored)]
     # Many readings show all points to some camera: the mistakes that people make come first.
     convincing = 3 * as_given + 0.1
     usual = [found for found in shares[:USUAL_MISTAKES] if found[0] > convincing]
@@ -341,7 +347,7 @@ def _seen_share(sequence: EndoscopicSequence, poses: Float[np.ndarray, "f 4 4"])
     return float(np.mean(shares))
 
 
-def _epipolar(sequence: EndoscopicSequence) -> Iterator[Finding]:
+def _epipolar(sequence: EndoscopicSequence, stored: PoseConvention) -> Iterator[Finding]:
     """Poses that features contradict.
 
     Depth contradicts other axes and units, and does not tell poses of other frames from those of a scope that
@@ -349,7 +355,7 @@ def _epipolar(sequence: EndoscopicSequence) -> Iterator[Finding]:
     """
     if sequence.world_from_camera is None:
         return
-    support = pose_support(sequence, match_neighbours(sequence))
+    support = pose_support(sequence, match_neighbours(sequence), stored)
     if support.matches < _MIN_MATCHES:
         return
     if support.best > _CONVINCING_SUPPORT and support.as_given < _CLEARLY_LESS * support.best:
@@ -358,7 +364,7 @@ def _epipolar(sequence: EndoscopicSequence) -> Iterator[Finding]:
             topic="pose direction" if "inverted" in support.best_name else "axes",
             sentence=f"the poses explain {support.as_given:.0%} of {support.matches} feature matches between "
             f"neighbouring frames, but {support.best:.0%} when they are read as {support.best_name}. "
-            "Expected OpenCV axes (x right, y down, z forward), camera to world",
+            f"Expected {stored.expected}",
             field="world_from_camera",
         )
     elif support.as_given < _POOR_SUPPORT:
@@ -437,10 +443,6 @@ _CHECKS: tuple[Callable[[EndoscopicSequence], Iterator[Finding]], ...] = (
     _intrinsics,
     _count,
     _poses,
-    _points,
-    _epipolar,
-    _disagreement,
-    _depth,
 )
 
 

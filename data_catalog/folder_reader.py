@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from data_catalog.dataset import Descriptor, file_digests
+from data_catalog.pose_conventions import OPENCV, PoseConvention
 from data_catalog.posed_frames import SourceFrames, assembled, chosen_frames, planned_sampling
 from extrags.config import IngestConfig
 from extrags.errors import ExtragsError, SourceError
@@ -116,6 +117,7 @@ class FolderReader:
             split, masks, undistortion, resizing and checks are done behind it. Raises `SourceError` naming
             file, frame and field.
         conventions: axes and units on disk, in one line.
+        poses: how files of this layout hold poses, in whose words wrong ones are told.
         notes: what reading has to find out about this folder, as sentences; raises what `frames` raises.
         named_sets: sequences of the catalogue in this layout, each a folder below a data root.
         known_name: the catalogue's name for a folder, where it has one; None goes by `named_sets`.
@@ -134,6 +136,7 @@ class FolderReader:
     files: Callable[[Path], list[Path]]
     frames: Callable[[Path, IngestConfig], SourceFrames]
     conventions: str = ""
+    poses: PoseConvention = OPENCV
     notes: Callable[[Path], tuple[str, ...]] | None = None
     named_sets: tuple[Descriptor, ...] = ()
     known_name: Callable[[Path], str | None] | None = None

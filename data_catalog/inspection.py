@@ -17,6 +17,7 @@ from data_catalog.diagnostics import diagnose
 from data_catalog.findings import Finding, warning
 from data_catalog.folder_reader import FolderReader
 from data_catalog.folders import find_reader
+from data_catalog.pose_conventions import OPENCV
 from data_catalog.specular import specular_masks
 from extrags.config import IngestConfig
 from extrags.errors import ExtragsError, SourceError, UnknownSequenceError
@@ -90,7 +91,8 @@ def inspect(name_or_path: str | Path, config: IngestConfig | None = None) -> Ins
         thinned = chosen or (config is not None and config.max_frames is not None)
         # What reading has warned of is said once.
         said = {item.topic for item in heard.findings}
-        found = diagnose(sequence, source.path or source.name, thinned=thinned)
+        stored = OPENCV if reader is None else reader.poses
+        found = diagnose(sequence, source.path or source.name, thinned=thinned, stored=stored)
         findings = [item for item in found if item.topic not in said]
     # Also where reading then failed: what it has warned of may be why.
     findings += [item.model_copy(update={"file": place}) for item in heard.findings]

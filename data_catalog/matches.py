@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from data_catalog.checks import neighbouring_frames, other_readings
+from data_catalog.checks import neighbouring_frames
+from data_catalog.pose_conventions import OPENCV, PoseConvention, other_readings
 from extrags.cameras import invert_poses, unproject_pixels
 from extrags.sequence import EndoscopicSequence
 
@@ -101,12 +102,15 @@ def match_neighbours(sequence: EndoscopicSequence, pairs: int = 6) -> list[Frame
     return matches
 
 
-def pose_support(sequence: EndoscopicSequence, matches: list[FrameMatches]) -> PoseSupport:
+def pose_support(
+    sequence: EndoscopicSequence, matches: list[FrameMatches], stored: PoseConvention = OPENCV
+) -> PoseSupport:
     """Count the matches that support the poses as given, and in every other reading of the axes.
 
     Args:
         sequence: with poses.
         matches: what `match_neighbours` found.
+        stored: how the file should hold poses, in whose words a reading is named.
     """
     poses = np.asarray(sequence.cameras.world_from_camera, dtype=np.float64)
     total = sum(len(match.first_px) for match in matches)
@@ -116,7 +120,7 @@ def pose_support(sequence: EndoscopicSequence, matches: list[FrameMatches]) -> P
     distance = float(np.median(depths)) if depths.size else 0.0
     as_given = best = supporting / total
     best_name = ""
-    for name, read in other_readings(poses):
+    for name, read in other_readings(poses, stored):
         share = _supporting(sequence, read, matches)[0] / total
         if share > best:
             best, best_name = share, name

@@ -36,6 +36,7 @@ from data_catalog.calibration_files import LENS_OF_POSES
 from data_catalog.folder_reader import FolderReader
 from data_catalog.images import save_images
 from data_catalog.inside import inside
+from data_catalog.pose_conventions import PoseConvention
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from data_catalog.readers.beside_frames import tell_about_folders
 from data_catalog.readers.colmap_files import (
@@ -247,6 +248,7 @@ READER = FolderReader(
     conventions="COLMAP poses (camera from world, OpenCV axes, inverted on reading), pixel "
     "centres at +0.5; arbitrary unit unless length_unit.txt says mm",
     chosen=_chosen,
+    poses=PoseConvention(world_to_camera=True),
 )
 
 

@@ -39,6 +39,7 @@ from jaxtyping import Bool, Float, UInt8
 from data_catalog.calibration_files import LENS_OF_POSES
 from data_catalog.folder_reader import FolderReader
 from data_catalog.images import color_files, read_color, read_mask, spread
+from data_catalog.pose_conventions import LLFF
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from extrags.array_files import load_npy
 from extrags.config import IngestConfig
@@ -174,6 +175,7 @@ READER = FolderReader(
     conventions="LLFF camera axes (down, right, backward), camera to world; mm; masks of detected polarity",
     notes=_notes,
     chosen=_chosen,
+    poses=LLFF,
 )
 
 

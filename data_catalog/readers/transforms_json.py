@@ -40,6 +40,7 @@ from data_catalog.images import (
     save_images,
 )
 from data_catalog.inside import inside
+from data_catalog.pose_conventions import OPENGL
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from data_catalog.readers.beside_frames import frames_among, listed_files, tell_about_folders
 from data_catalog.readers.frame_list import listed_split, load_frame_list, matrix_of, present_frames
@@ -190,6 +191,7 @@ READER = FolderReader(
     conventions="OpenGL camera axes (y up, z backward, turned on reading), camera to world; "
     "depth in thousandths of the pose unit unless it says otherwise",
     chosen=_chosen,
+    poses=OPENGL,
 )
 
 

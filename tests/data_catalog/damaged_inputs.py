@@ -285,7 +285,7 @@ DAMAGES = {
         "cameras.bin",
     ),
     "COLMAP poses not inverted": Damage(
-        "colmap", model(inverted), r"world-to-camera \(inverted\), OpenCV axes", None, "world_from_camera"
+        "colmap", model(inverted), r"camera-to-world \(not inverted\), OpenCV axes", None, "world_from_camera"
     ),
     "COLMAP camera of another size": Damage(
         "text",
@@ -330,7 +330,7 @@ DAMAGES = {
     "transforms.json in OpenCV axes": Damage(
         "ngp",
         edited("transforms.json", without_flip),
-        "when they are read as OpenGL axes",
+        r"when they are read as OpenCV axes\. Expected OpenGL axes \(x right, y up, z backward\), camera to",
         None,
         "world_from_camera",
     ),

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from data_catalog.catalog import read
-from data_catalog.checks import check_sequence, depth_disagreement, other_readings
+from data_catalog.checks import check_sequence, depth_disagreement
 from data_catalog.diagnostics import diagnose
 from extrags.cameras import invert_poses
 from extrags.config import IngestConfig
@@ -32,22 +32,6 @@ def narrow(shared_data: Path) -> EndoscopicSequence:
 
 def topics(sequence: EndoscopicSequence) -> dict[str, str]:
     return {finding.topic: finding.sentence for finding in diagnose(sequence, "somewhere")}
-
-
-def test_readings_begin_with_the_mistakes_that_people_make() -> None:
-    pose = np.eye(4)[None].copy()
-    pose[0, :3, 3] = 1, 2, 3
-    names, read_as = zip(*other_readings(pose), strict=True)
-    assert len(set(names)) == 47
-    assert [name.split(" (y up")[0] for name in names[:3]] == [
-        "world-to-camera (inverted), OpenCV axes",
-        "OpenGL axes",
-        "world-to-camera (inverted), OpenGL axes",
-    ]
-    np.testing.assert_allclose(read_as[0], invert_poses(pose))
-    np.testing.assert_allclose(read_as[1], pose @ OPEN_GL)
-    np.testing.assert_allclose(read_as[2], invert_poses(pose) @ OPEN_GL)
-    assert not any(np.allclose(reading, pose) for reading in read_as)
 
 
 @pytest.mark.parametrize(
