@@ -23,7 +23,8 @@ def splat_format(path: Path) -> Literal["ply", "spz"]:
 
     Raises:
         SourceNotFoundError: when there is no such file.
-        SourceError: when it is of neither format; names those that are written here and not read.
+        SourceError: when it is of neither format, or a PLY of something else; names those that are written
+            here and not read.
     """
     path = Path(path)
     if not path.is_file():
@@ -36,8 +37,15 @@ def splat_format(path: Path) -> Literal["ply", "spz"]:
     if start[:2] == b"\x1f\x8b" or start[:4] == b"NGSP":
         return "spz"
     if start[:3] == b"ply":
-        if f" {PACKED_PROPERTY}".encode() in start.partition(b"end_header")[0]:
+        header, end, _ = start.partition(b"end_header")
+        if f" {PACKED_PROPERTY}".encode() in header:
             raise SourceError(COMPRESSED_PLY, file=path, field=PACKED_PROPERTY)
+        if end and b" opacity" not in header:
+            raise SourceError(
+                "not a 3DGS PLY: the property is missing, as in meshes and clouds of points",
+                file=path,
+                field="opacity",
+            )
         return "ply"
     if start[:4] == b"PK\x03\x04":
         raise SourceError(

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from extrags.errors import ConfigError, ExtragsError, SourceError, UnknownSequenceError
+from extrags.errors import ConfigError, ExtragsError, PoseError, SourceError, UnknownSequenceError
 from flows.outcome import SequenceOutcome, StageRow
 
 if TYPE_CHECKING:
@@ -74,14 +74,30 @@ def check_working_distance(cases: Sequence[SequenceCase]) -> None:
 def wrong_source(case: SequenceCase, until: StageName) -> SequenceOutcome | None:
     """How a run would fail whose source can be seen to be wrong without reading pictures; else None."""
     from data_catalog import glance
+    from extrags.stages import stages_until
+
+    config = case.config()
+    try:
+        seen = glance(case.sequence, config.ingest)
+    except SourceError as error:
+        return _failed(case, until, "ingest", error)
+    if seen is not None and not seen.has_poses and "poses" in stages_until(until):
+        try:
+            config.check_imported_has_cameras()
+        except PoseError as error:
+            return _failed(case, until, "poses", error)
+    return None
+
+
+def _failed(case: SequenceCase, until: StageName, stage: StageName, error: SourceError) -> SequenceOutcome:
+    """A run that fails in a stage before any has run."""
     from data_catalog.names import plain_name
     from extrags.stages import stages_until
 
-    try:
-        glance(case.sequence, case.config().ingest)
-    except SourceError as error:
-        rest = stages_until(until)[1:]
-        rows = [StageRow("ingest", "failed", reason=str(error))]
-        rows += [StageRow(stage, "skipped", reason="ingest failed") for stage in rest]
-        return SequenceOutcome(plain_name(case.sequence), "failed", rows, error=error)
-    return None
+    rows = [
+        StageRow(stage, "failed", reason=str(error))
+        if other == stage
+        else StageRow(other, "skipped", reason=f"{stage} failed")
+        for other in stages_until(until)
+    ]
+    return SequenceOutcome(plain_name(case.sequence), "failed", rows, error=error)

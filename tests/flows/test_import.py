@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from extrags.config import PipelineConfig
 from extrags.gaussians import Gaussians
@@ -159,3 +160,29 @@ class TestCommand:
         said = capsys.readouterr().err
         assert message in said
         assert "Traceback" not in said
+
+
+def test_frames_without_poses_are_refused_before_they_are_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A video was read and its frames chosen before the run said so."""
+
+    def started(**_: object) -> None:
+        pytest.fail("a flow was started")
+
+    monkeypatch.setattr("flows.dataset.reconstruct_dataset", started)
+    frames = tmp_path / "frames"
+    frames.mkdir()
+    for number in range(8):
+        Image.new("RGB", (48, 40), (90, 10 * number, 30)).save(frames / f"{number:04d}.png")
+    scene = tmp_path / "scene.ply"
+    scene.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float opacity\nend_header\n")
+    results = tmp_path / "results.json"
+    arguments = ["--store", str(tmp_path / "store"), "--json", str(results)]
+    assert main(["import", str(scene), "--sequence", str(frames), *arguments]) == 1
+    assert "failed in poses" in capsys.readouterr().err
+    (found,) = json.loads(results.read_text())["sequences"]
+    states = {row["stage"]: (row["state"], row["reason"]) for row in found["stages"]}
+    assert states["ingest"] == ("skipped", "poses failed")
+    assert states["poses"][0] == "failed"
+    assert "an imported scene needs the cameras it was made with" in states["poses"][1]

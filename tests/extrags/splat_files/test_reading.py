@@ -15,6 +15,7 @@ from extrags.errors import SourceError, SourceNotFoundError
 from extrags.gaussians import Gaussians
 from extrags.scene import Scene
 from extrags.splat_files import read_splat_file, read_spz, write_compressed_ply, write_sog, write_spz
+from extrags.splat_files.reading import splat_format
 
 
 def packed(content: bytes) -> bytes:
@@ -63,6 +64,15 @@ class TestRefused:
         with pytest.raises(SourceError, match=message) as found:
             read_splat_file(file)
         assert found.value.file == str(file)
+
+    def test_a_cloud_of_points_is_told_by_its_header(self, tmp_path: Path) -> None:
+        """An import found out after it had read the frames."""
+        file = tmp_path / "points.ply"
+        properties = b"".join(b"property float " + name + b"\n" for name in (b"x", b"y", b"z"))
+        file.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 9\n" + properties + b"end_header\n")
+        with pytest.raises(SourceError, match="as in meshes and clouds of points") as found:
+            splat_format(file)
+        assert found.value.field == "opacity"
 
     def test_our_own_formats_that_are_not_read_are_named(self, few: Gaussians, tmp_path: Path) -> None:
         write_sog(few, tmp_path / "a.sog")
