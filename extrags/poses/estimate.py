@@ -23,6 +23,7 @@ from extrags.poses.registration_report import (
     expected_frames,
     failure_message,
     frames_without_pose,
+    parallax_warning,
 )
 from extrags.poses.rgbd import align_by_depth
 from extrags.poses.scale import typical_depth
@@ -231,6 +232,8 @@ def _by_colmap(
     if not enough_registered(report, config):
         return None, report
     _warn_of_missing(sequence, report)
+    if (warning := parallax_warning(report)) is not None:
+        _LOG.warning("%s: %s", sequence.name, warning)
     found = _from_colmap(seen, attempt.result, attempt.registered, report, config)
     return replace(found, calibration=calibration), report
 

@@ -18,6 +18,7 @@ __all__ = [
     "expected_frames",
     "failure_message",
     "frames_without_pose",
+    "parallax_warning",
     "triangulation_angles_deg",
 ]
 
@@ -177,6 +178,25 @@ def failure_message(name: str, report: dict[str, Any], min_share: float, *, widt
         instead,
     ]
     return " ".join(parts)
+
+
+def parallax_warning(report: dict[str, Any]) -> str | None:
+    """What is to be said of a map whose points are hardly triangulated, as a sentence; None where they are.
+
+    A scope that turns on the spot gets poses with good reprojection errors: the little motion that the
+    noise of its features allows, and points at distances that it makes up.
+
+    Args:
+        report: from `colmap_report`.
+    """
+    angle = float(report["triangulation_angle_deg"])
+    if not 0 < angle < LITTLE_PARALLAX_DEG:
+        return None
+    return (
+        f"the rays to a point differ by {_degrees(angle)}, where {LITTLE_PARALLAX_DEG:g} or more tell its "
+        "distance: the scope turns or stands where it should move. Positions of cameras and shape are hardly "
+        "determined; give a part of the recording with sideways motion, or frames farther apart"
+    )
 
 
 def _advice(report: dict[str, Any], width: int) -> str:

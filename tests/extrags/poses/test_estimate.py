@@ -17,7 +17,7 @@ from extrags.config import PosesConfig
 from extrags.errors import CaptureError, ShapeError
 from extrags.events import Event, Progress, subscribed
 from extrags.metrics.pose import absolute_trajectory_error
-from extrags.poses import PoseEstimate, estimate_poses, with_estimated_poses
+from extrags.poses import PoseEstimate, estimate_poses, registration_report, with_estimated_poses
 from extrags.poses.job import PoseJob, PoseJobResult
 from extrags.sequence import EndoscopicSequence
 from tests.extrags.poses.textured_room import HALF_SIZE_MM, room_sequence, turning_room
@@ -296,6 +296,18 @@ def test_a_scope_that_only_turns(
     ):
         with pytest.raises(CaptureError, match=f"too little parallax.*{instead}"):
             estimate_poses(replace(turning, depth_mm=None), CONFIG.model_copy(update={"fallback": fallback}))
+
+
+def test_poses_that_parallax_hardly_tells_come_with_a_warning(
+    run: Run, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    complete = estimate_module._run(estimate_module._job(run.sequence, CONFIG), "arc")
+    monkeypatch.setattr(estimate_module, "_run", lambda *_: complete)
+    estimate_poses(run.sequence, CONFIG)
+    assert "sideways motion" not in caplog.text
+    monkeypatch.setattr(registration_report, "LITTLE_PARALLAX_DEG", 90.0)
+    estimate_poses(run.sequence, CONFIG)
+    assert "give a part of the recording with sideways motion" in caplog.text
 
 
 def test_a_second_attempt_is_lenient_and_counts_where_it_registers_more(

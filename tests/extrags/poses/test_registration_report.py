@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from extrags.poses import errors_against_given
+from extrags.poses.registration_report import parallax_warning
 from extrags.sequence import EndoscopicSequence, Split
 
 FRAMES = 8
@@ -57,3 +58,12 @@ def test_what_all_frames_have_in_common_is_no_error_but_by_itself() -> None:
     errors = errors_against_given(given, found, metric=True)["train"]
     assert errors["rotation_mean_deg"] == pytest.approx(5)
     assert errors["rotation_without_common_turn_mean_deg"] == pytest.approx(0, abs=1e-4)
+
+
+@pytest.mark.parametrize(("angle", "warned"), [(0.0, False), (0.93, True), (1.9, True), (7.0, False)])
+def test_a_map_without_parallax_is_told(angle: float, warned: bool) -> None:
+    """A scope that turned on the spot, with a lens that nobody stated, got poses without a word: 0.93."""
+    told = parallax_warning({"triangulation_angle_deg": angle})
+    assert (told is not None) == warned
+    if told is not None:
+        assert f"differ by {angle:.1f} degrees (median), where 2 or more tell its distance" in told
