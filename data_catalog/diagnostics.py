@@ -39,6 +39,8 @@ _POOR_SUPPORT = 0.4
 _EXPOSURE_JUMP = 0.5
 _EXPOSURE_DEVIATIONS = 8.0
 _MIN_BASELINE_SHARE = 0.02
+_NEAREST_MM = 0.5
+"""Nothing nearer is seen sharply; what an endoscope sees is at 2 to 200 mm, which are 0.002 to 0.2 m."""
 _JUMP = 8.0
 _CLIPPED_SHARE = 0.02
 _SATURATED_SHARE = 0.6
@@ -270,6 +272,19 @@ def _poses(sequence: EndoscopicSequence) -> Iterator[Finding]:
         yield from _pose_steps(sequence, members)
 
 
+def _unit(sequence: EndoscopicSequence) -> Iterator[Finding]:
+    """Lengths that are called millimetres and are metres, which nothing else contradicts."""
+    distance = _scene_distance(sequence)
+    if sequence.metric and distance is not None and distance < _NEAREST_MM:
+        yield warning(
+            "unit",
+            f"lengths are taken for millimetres, and what cameras see is {distance:.3g} mm away (median), "
+            "nearer than endoscopes see: are they metres? Multiply depth and positions of cameras by 1000, "
+            "or state an arbitrary unit and give its millimetres (--scale 1000)",
+            field="length_unit",
+        )
+
+
 def _parallax(reach: float, distance: float, cure: str = "or give depth") -> Iterator[Finding]:
     if reach < _MIN_BASELINE_SHARE * distance:
         yield warning(
@@ -443,6 +458,7 @@ _CHECKS: tuple[Callable[[EndoscopicSequence], Iterator[Finding]], ...] = (
     _intrinsics,
     _count,
     _poses,
+    _unit,
 )
 
 

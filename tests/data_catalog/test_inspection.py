@@ -201,6 +201,17 @@ def test_intrinsics_of_the_picture_on_its_side_are_told(clip) -> None:
     assert told in found[0].sentence
 
 
+def test_metres_that_are_called_millimetres_are_told(clip) -> None:
+    """Depth and poses in one unit contradict nothing, and the report said millimetres."""
+    poses = clip.world_from_camera.copy()
+    poses[:, :3, 3] /= 1000
+    metres = replace(clip, world_from_camera=poses, depth_mm=clip.depth_mm / 1000)
+    for sequence, told in ((clip, False), (metres, True), (replace(metres, metric=False), False)):
+        found = [finding for finding in diagnose(sequence, "here") if finding.topic == "unit"]
+        assert len(found) == told
+        assert all("nearer than endoscopes see: are they metres?" in item.sentence for item in found)
+
+
 def test_memory_does_not_grow_with_the_frames(clip) -> None:
     """What is made of all frames at once would be as large as they are."""
     peaks = []
