@@ -13,7 +13,10 @@ from flows.commands.options import Parser, add_json, add_sequence, add_settings,
 from flows.commands.outputs import output_file
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from data_catalog import Descriptor
+    from data_catalog.inspection import Inspection
     from extrags.config import IngestConfig
     from extrags.sequence import EndoscopicSequence
 
@@ -127,7 +130,7 @@ def show(given: argparse.Namespace) -> int:
     if given.json != "-":
         table = Table(box=None, show_header=False, pad_edge=False)
         for name, value in ((key, value) for key, value in described.items() if value not in ([], "")):
-            table.add_row(f"[bold]{name}[/]", escape(str(value)))
+            table.add_row(f"[bold]{name}[/]", escape(_listed(value)))
         if measured is not None:
             table.add_row("", "")
             for name, value in measured.items():
@@ -147,42 +150,48 @@ def check(given: argparse.Namespace) -> int:
     """
     if given.debug:
         set_up_logging(debug=True, terminal=True)
-    from rich.markup import escape
-
     from data_catalog.inspection import inspect
     from flows.terminal import console
 
     config = _ingest(given)
     inspections, unknown = [], []
+    out = console()
     for name in given.sources:
         try:
-            inspections.append(inspect(name, config))
+            found = inspect(name, config)
         except UnknownSequenceError as error:
             unknown.append(str(error))
-    if given.json != "-":
-        out = console()
-        for found in inspections:
-            form = "" if found.format is None else f" ({found.format})"
-            state = "[green]nothing is wrong[/]" if found.ok else f"[red]{len(found.findings)} found[/]"
-            out.print(f"[bold]{escape(found.name)}[/]{form}: {state}")
-            if found.conventions:
-                out.print(f"  read as: {escape(found.conventions)}", soft_wrap=True)
-            for note in found.notes:
-                out.print(f"  note: {escape(note)}", soft_wrap=True)
-            for finding in found.findings:
-                color = "red" if finding.kind == "error" else "yellow"
-                out.print(
-                    f"  [{color}]{finding.kind}[/] {escape(finding.topic)}: {escape(str(finding))}",
-                    soft_wrap=True,
-                )
-            if found.facts is not None:
-                shares = ("masked_share", "specular_share", "saturated_share")
-                told = ", ".join(f"{name.removesuffix('_share')} {found.facts[name]:.1%}" for name in shares)
-                out.print(f"  {counted(found.facts['frames'], 'frame')}; pixels {told}")
+            continue
+        inspections.append(found)
+        if given.json != "-":
+            # One after another, since reading a recording may take minutes.
+            _print_inspection(out, found)
     write_json([{"ok": found.ok, **found.model_dump(mode="json")} for found in inspections], given.json)
     if unknown:
         raise UnknownSequenceError("\n".join(unknown))
     return 0 if all(found.ok for found in inspections) else 1
+
+
+def _print_inspection(out: Console, found: Inspection) -> None:
+    from rich.markup import escape
+
+    form = "" if found.format is None else f" ({found.format})"
+    state = "[green]nothing is wrong[/]" if found.ok else f"[red]{len(found.findings)} found[/]"
+    out.print(f"[bold]{escape(found.name)}[/]{form}: {state}")
+    if found.conventions:
+        out.print(f"  read as: {escape(found.conventions)}", soft_wrap=True)
+    for note in found.notes:
+        out.print(f"  note: {escape(note)}", soft_wrap=True)
+    for finding in found.findings:
+        color = "red" if finding.kind == "error" else "yellow"
+        out.print(
+            f"  [{color}]{finding.kind}[/] {escape(finding.topic)}: {escape(str(finding))}",
+            soft_wrap=True,
+        )
+    if found.facts is not None:
+        shares = ("masked_share", "specular_share", "saturated_share")
+        told = ", ".join(f"{name.removesuffix('_share')} {found.facts[name]:.1%}" for name in shares)
+        out.print(f"  {counted(found.facts['frames'], 'frame')}; pixels {told}")
 
 
 def _known(name: str) -> Descriptor | None:
@@ -213,6 +222,10 @@ def _write_picture(sequence: EndoscopicSequence, target: Path) -> None:
             Image.fromarray(contact_sheet(sequence)).save(unfinished)
     except (OSError, ValueError) as error:
         raise StoreError(f"{target} cannot be written: {error}") from error
+
+
+def _listed(value: Any) -> str:
+    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
 def _figure(name: str, value: Any) -> str:

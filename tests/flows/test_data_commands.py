@@ -10,10 +10,11 @@ import pytest
 from PIL import Image
 
 from data_catalog.catalog import read
+from data_catalog.inspection import Inspection, inspect
 from data_catalog.phantom.config import PhantomConfig
 from data_catalog.phantom.recording import record
 from data_catalog.readers.colmap_model import write_colmap
-from extrags.config import PipelineConfig
+from extrags.config import IngestConfig, PipelineConfig
 from extrags.sequence import EndoscopicSequence
 from extrags.store import Store
 from flows.cli import main
@@ -97,6 +98,7 @@ class TestShow:
         said = capsys.readouterr().out
         assert "specular_share" in said
         assert "colmap" in said
+        assert "['" not in said
 
     def test_without_the_data(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -120,6 +122,25 @@ class TestCheck:
         said = capsys.readouterr().out
         assert "nothing is wrong" in said
         assert "the folder is empty" in said
+
+    def test_each_is_told_once_it_is_read(
+        self, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """Of several long recordings nothing was said before the last of them was read."""
+        told = []
+
+        def heard(name: str, config: IngestConfig) -> Inspection:
+            told.append(capsys.readouterr().out)
+            return inspect(name, config)
+
+        monkeypatch.setattr("data_catalog.inspection.inspect", heard)
+        folders = [tmp_path / name for name in ("first", "second")]
+        for folder in folders:
+            folder.mkdir()
+        assert main(["data", "check", *map(str, folders)]) == 1
+        assert told[0] == ""
+        assert "first: 1 found" in told[1]
+        assert "second: 1 found" in capsys.readouterr().out
 
     def test_as_json(self, scene: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         (tmp_path / "poses.json").write_text("{")
