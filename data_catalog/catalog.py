@@ -128,7 +128,10 @@ def glance(name_or_path: str | Path, config: IngestConfig | None = None) -> Glan
     _check_own(dataset, source, config)
     _check_time_span(source, config)
     with _permission_named():
-        return dataset.glance(source, config) if isinstance(dataset, FolderDataset) else None
+        seen = dataset.glance(source, config) if isinstance(dataset, FolderDataset) else None
+    if seen is not None and not seen.has_poses and config.scale_mm_per_unit is not None:
+        raise _no_unit(source.name)
+    return seen
 
 
 def read(source: Source | str | Path, config: IngestConfig | None = None) -> EndoscopicSequence:
@@ -279,16 +282,20 @@ def _no_name(given: object) -> ConfigError:
 
 def _scaled(sequence: EndoscopicSequence, mm_per_unit: float) -> EndoscopicSequence:
     if sequence.world_from_camera is None:
-        raise ConfigError(
-            f"{sequence.name}: ingest.scale_mm_per_unit is the unit of the source's poses, and there are "
-            "none; poses.working_distance_mm makes estimated poses metric"
-        )
+        raise _no_unit(sequence.name)
     if sequence.metric:
         raise ConfigError(
             f"{sequence.name}: the source's lengths are millimetres; ingest.scale_mm_per_unit is for sources "
             "whose unit is arbitrary"
         )
     return sequence.in_millimetres(mm_per_unit, "setting")
+
+
+def _no_unit(name: str) -> ConfigError:
+    return ConfigError(
+        f"{name}: ingest.scale_mm_per_unit is the unit of the source's poses, and there are none; "
+        "poses.working_distance_mm makes estimated poses metric"
+    )
 
 
 def _dataset(source: Source) -> Dataset:

@@ -106,6 +106,17 @@ class TestFolders:
         with pytest.raises(SourceNotFoundError, match="the folder is empty"):
             glance(plain_frames)
 
+    def test_a_unit_of_poses_that_are_not_there_is_refused(self, plain_frames: Path) -> None:
+        """A recording was read to its end before this was said."""
+        for looked in (glance, read):
+            with pytest.raises(
+                ConfigError, match=r"scale_mm_per_unit is the unit of the source's poses, and"
+            ):
+                looked(plain_frames, IngestConfig(scale_mm_per_unit=20))
+
+    def test_a_unit_of_poses_that_are(self, posed_folder: Path) -> None:
+        assert glance(posed_folder, IngestConfig(scale_mm_per_unit=20)) is not None
+
 
 class TestFootage:
     def test_a_short_video(self, tmp_path: Path) -> None:

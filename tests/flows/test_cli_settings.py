@@ -56,6 +56,14 @@ class TestSettingsOfOtherSources:
         assert "ingest.scale_mm_per_unit (--scale)" in said
         assert said.count("\n") == 1
 
+    def test_a_unit_of_poses_that_are_not_there(
+        self, frames: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        assert main(["run", frames, "--scale", "20", "--store", str(tmp_path / "store")]) == 2
+        said = capsys.readouterr().err
+        assert said.startswith("extrags: frames: ingest.scale_mm_per_unit is the unit of the source's poses")
+        assert said.count("\n") == 1
+
     def test_a_distance_for_poses_that_are_estimated(self, frames: str) -> None:
         again = {**DISTANCE, "poses.replace_given": True}
         check_working_distance([SequenceCase(frames, settings=DISTANCE)])
