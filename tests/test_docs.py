@@ -9,9 +9,13 @@ import re
 import shlex
 import unicodedata
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 from pydantic import BaseModel
 
@@ -217,6 +221,29 @@ def registered_for_one_test() -> Iterator[None]:
 def test_runnable_blocks_run(page: str, code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     exec(compile(code, page, "exec"), {"__name__": "__main__"})
+
+
+def test_the_first_program_is_right_for_frames_without_poses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It asked the frames for cameras that only the result has."""
+    import extrags
+
+    posed = extrags.read("phantom/0@sparse", extrags.IngestConfig(width=48, max_frames=4))
+    assert posed.world_from_camera is not None
+    points = posed.world_from_camera[:, :3, 3] + 20 * posed.world_from_camera[:, :3, 2]
+    scene = extrags.Scene(
+        extrags.Gaussians.from_points(points, np.full_like(points, 0.5), np.ones(len(points)))
+    )
+    result = SimpleNamespace(sequence=posed, scene=scene)
+    monkeypatch.setattr(extrags, "read", lambda *_: replace(posed, world_from_camera=None, observed=None))
+    monkeypatch.setattr(extrags, "run_pipeline", lambda *_, **__: result)
+    monkeypatch.chdir(tmp_path)
+    code, _ = next(blocks(REPOSITORY / "docs" / "python.md", "python"))
+    made: dict[str, Any] = {}
+    exec(compile(code, "python.md", "exec"), made)
+    assert made["image"].shape == (1, posed.height, posed.width, 3)
+    assert (tmp_path / "scene.ply").is_file()
 
 
 def commands() -> Iterator[tuple[str, str]]:
