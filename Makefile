@@ -41,6 +41,10 @@ demo: setup ## Reconstruct, explore, restore and evaluate the phantom, both sett
 
 # Tests start many programs, each of which would compile the project anew.
 test test-slow: export PYTHONDONTWRITEBYTECODE :=
+# Arrays that a test has freed serve the next one, instead of being given back and zeroed anew: 6 % less time.
+test test-slow: export MALLOC_MMAP_THRESHOLD_ := 1000000000
+test test-slow: export MALLOC_TRIM_THRESHOLD_ := 1000000000
+test test-slow: export MALLOC_TOP_PAD_ := 67108864
 
 test: setup ## The default test suite
 	$(BIN)/python -m pytest $(PARALLEL)
