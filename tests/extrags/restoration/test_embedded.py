@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import copy
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -234,6 +235,26 @@ class TestEmbedded:
             assert isinstance(alone, EmbeddedEnhancer)
             assert kept.record["judged"] == alone.record["judged"]
 
+    @pytest.fixture
+    def judged(
+        self,
+        trained: EmbeddedEnhancer,
+        tube_pairs: Pairs,
+        tube: Tube,
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> Callable[..., Enhancer]:
+        """What serves where a restorer loses so much to blending and filling."""
+
+        def of(restorer: EmbeddedEnhancer, lost_db: float, **options: Any) -> Enhancer:
+            scores = {
+                f"embedded_{trained.steps}": {"psnr_kept": 20.0},
+                "classical": {"psnr_kept": 20.0 + lost_db},
+            }
+            monkeypatch.setattr(scene_restorer, "scores_of", lambda *_: scores)
+            return best_of_all([restorer], tube_pairs, tube.references.transfer, **options)
+
+        return of
+
     @pytest.mark.parametrize(
         ("lost_db", "score", "served_by"),
         [(0.3, 0.9, "plain"), (0.05, 1.1, "seamless"), (0.3, 1.1, "filling"), (0.7, 0.9, "filling")],
@@ -241,19 +262,12 @@ class TestEmbedded:
     def test_on_unfamiliar_scenes_no_loss_is_tolerated_but_of_cloning(
         self,
         trained: EmbeddedEnhancer,
-        tube_pairs: Pairs,
-        tube: Tube,
-        monkeypatch,
+        judged: Callable[..., Enhancer],
         lost_db: float,
         score: float,
         served_by: str,
     ) -> None:
-        scores = {
-            f"embedded_{trained.steps}": {"psnr_kept": 20.0},
-            "classical": {"psnr_kept": 20.0 + lost_db},
-        }
-        monkeypatch.setattr(scene_restorer, "scores_of", lambda *_: scores)
-        served = best_of_all([replace(trained, domain_score=score)], tube_pairs, tube.references.transfer)
+        served = judged(replace(trained, domain_score=score), lost_db)
         assert isinstance(served, EmbeddedEnhancer) == (served_by != "filling")
         assert getattr(served, "seamless", False) == (served_by == "seamless")
 
@@ -262,21 +276,13 @@ class TestEmbedded:
     def test_what_clones_by_hand_is_held_to_the_same(
         self,
         trained: EmbeddedEnhancer,
-        tube_pairs: Pairs,
-        tube: Tube,
-        monkeypatch,
+        judged: Callable[..., Enhancer],
         lost_db: float,
         score: float,
         serves: bool,
     ) -> None:
-        scores = {
-            f"embedded_{trained.steps}": {"psnr_kept": 20.0},
-            "classical": {"psnr_kept": 20.0 + lost_db},
-        }
-        monkeypatch.setattr(scene_restorer, "scores_of", lambda *_: scores)
         cloning = replace(trained, domain_score=score).cloning_seamlessly()
-        served = best_of_all([cloning], tube_pairs, tube.references.transfer, cloning="always")
-        assert isinstance(served, EmbeddedEnhancer) == serves
+        assert isinstance(judged(cloning, lost_db, cloning="always"), EmbeddedEnhancer) == serves
 
     @pytest.mark.parametrize("judge", [True, False])
     def test_unjudged_unfamiliar_scenes_keep_what_is_known(
