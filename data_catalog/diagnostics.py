@@ -39,6 +39,7 @@ _POOR_SUPPORT = 0.4
 _EXPOSURE_JUMP = 0.5
 _EXPOSURE_DEVIATIONS = 8.0
 _MIN_BASELINE_SHARE = 0.02
+_Check = Callable[[EndoscopicSequence], Iterator[Finding]]
 _NEAREST_MM = 0.5
 """Nothing nearer is seen sharply; what an endoscope sees is at 2 to 200 mm, which are 0.002 to 0.2 m."""
 _JUMP = 8.0
@@ -63,8 +64,9 @@ def diagnose(
         stored: how the file should hold poses, for findings about them.
     """
     found: list[Finding] = []
-    checks = (*(() if thinned else (_missing,)), *_CHECKS, partial(_points, stored=stored))
-    for check in (*checks, partial(_epipolar, stored=stored), _disagreement, _depth):
+    of_poses = (partial(_points, stored=stored), partial(_epipolar, stored=stored))
+    checks: tuple[_Check, ...] = (*_CHECKS, *of_poses, _disagreement, _depth)
+    for check in checks if thinned else (_missing, *checks):
         found += [finding.model_copy(update={"file": file}) for finding in check(sequence)]
     return found
 
@@ -450,7 +452,7 @@ def _depth(sequence: EndoscopicSequence) -> Iterator[Finding]:
         )
 
 
-_CHECKS: tuple[Callable[[EndoscopicSequence], Iterator[Finding]], ...] = (
+_CHECKS: tuple[_Check, ...] = (
     _order,
     _images,
     _exposure,

@@ -144,7 +144,7 @@ def image_size(file: Path, *, frame: object = None) -> tuple[int, int]:
 
 
 def read_upright(file: Path, *, frame: object = None) -> UInt8[np.ndarray, "h w 3"]:
-    """As `read_color`, turned and mirrored as viewers show the image (`orientation`).
+    """As `read_color`, turned and mirrored as viewers show the image (`orientation`), [H, W, 3].
 
     Raises:
         SourceNotFoundError: there is no such file.

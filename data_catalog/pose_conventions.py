@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -18,18 +19,20 @@ from extrags.cameras import invert_poses
 
 __all__ = ["LLFF", "OPENCV", "OPENGL", "USUAL_MISTAKES", "PoseConvention", "other_readings"]
 
+Axes = Literal["OpenCV", "OpenGL", "LLFF"]
+"""Axes of cameras in files that are read here."""
 USUAL_MISTAKES = 3
 """How many of `other_readings`, the first ones, are mistakes that people make."""
-_EXPECTED = {
+_EXPECTED: dict[Axes, str] = {
     "OpenCV": "OpenCV axes (x right, y down, z forward)",
     "OpenGL": "OpenGL axes (x right, y up, z backward)",
     "LLFF": "LLFF axes (down, right, backward)",
 }
-_FOUND = {
+_FOUND: dict[Axes, str] = {
     "OpenCV": "OpenCV axes",
     "OpenGL": "OpenGL axes (y up, z backward: columns y and z negated)",
 }
-_OPENCV_IN = {
+_OPENCV_IN: dict[Axes, Float[np.ndarray, "3 3"]] = {
     "OpenCV": np.eye(3),
     "OpenGL": np.diag([1.0, -1.0, -1.0]),
     "LLFF": np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]]),
@@ -42,11 +45,11 @@ class PoseConvention:
     """Poses as a format stores them.
 
     Args:
-        axes: of the cameras: `OpenCV`, `OpenGL` or `LLFF`.
+        axes: of the cameras.
         world_to_camera: whether matrices map world to camera, and are inverted on reading.
     """
 
-    axes: str = "OpenCV"
+    axes: Axes = "OpenCV"
     world_to_camera: bool = False
 
     @property

@@ -213,7 +213,7 @@ def restored_shares(
         return None
     known, invented = _Errors(), _Errors()
     restorers = itertools.repeat(enhancer) if kept is None else (among_kept(enhancer, own) for own in kept)
-    for (coarse, renders, sequence), restorer in zip(trials, restorers, strict=False):
+    for (coarse, renders, sequence), restorer in zip(trials, restorers, strict=kept is not None):
         if sequence.lens is not None:
             training, renders = sequence.as_pinhole(), _flattened(renders, sequence)[0]
             sequence = sequence.as_pinhole(WIDE_FIELD_DEG)
