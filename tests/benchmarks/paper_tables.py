@@ -77,8 +77,9 @@ def methods_tables(cases: Sequence[dict[str, Any]]) -> str:
             for method in order
             if (times := [case["seconds"] for case in runs if case["method"] == method])
         }
+        measured = [metric for metric in METRICS if any(metric in row["figures"] for row in by_method.values())]
         for aligned in (False, True):
-            shown = METRICS[:5] if aligned else METRICS
+            shown = [metric for metric in measured if not (aligned and metric.startswith("depth"))]
             table = []
             for region in REGIONS:
                 for method in [method for method in order if method in by_method]:

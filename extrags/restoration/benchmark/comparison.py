@@ -244,7 +244,9 @@ def compare_methods(
     methods: Sequence[str],
     lpips: LpipsByNet | None,
 ) -> list[dict[str, Any]]:
-    """Compare methods on the held-out views of a sequence, of frames through a lens as pinholes.
+    """Compare methods on the held-out views of a sequence, as a run restores them.
+
+    Frames through a lens become pinholes, and frames wider than `enhance.max_width` are shrunk to it.
 
     Args:
         scene: its coarse scene.
@@ -263,8 +265,11 @@ def compare_methods(
         ConfigError: for an unknown method.
     """
     methods = check_methods(methods)
-    # Restorers see pinholes, as in a run.
-    sequence = sequence.as_pinhole()
+    # Restorers see pinholes of the working size, as in a run.
+    width = config.enhance.working_width(sequence.width)
+    if width < sequence.width:
+        logger.info("bench enhance: %s is compared %d pixels wide (enhance.max_width)", sequence.name, width)
+    sequence = sequence.as_pinhole().at_most_width(width)
     training = sequence.training_part()
     references = gather_references(scene, training, training.train)
     clips = held_out_clips(

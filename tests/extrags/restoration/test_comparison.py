@@ -53,6 +53,23 @@ class TestBench:
         assert cases[3]["psnr"] == pytest.approx(classical, abs=0.3)
         json.dumps(cases, allow_nan=False)
 
+    def test_views_have_the_working_width(self, tube: Tube, monkeypatch: pytest.MonkeyPatch) -> None:
+        widths = []
+        clips = bench.held_out_clips
+        monkeypatch.setattr(
+            bench,
+            "held_out_clips",
+            lambda scene, references, sequence, *given, **settings: (
+                widths.append((references.packed.shape[-1], sequence.width))
+                or clips(scene, references, sequence, *given, **settings)
+            ),
+        )
+        assert tube.sequence.width > 32
+        compare_methods(tube.scene, tube.sequence, self.CONFIG, ["none"], None)
+        narrow = PipelineConfig(enhance=EnhanceConfig(references=4, max_width=32))
+        compare_methods(tube.scene, tube.sequence, narrow, ["none"], None)
+        assert widths == [(tube.sequence.width, tube.sequence.width), (32, 32)]
+
     def test_equal_recipes_are_followed_once(self, tube: Tube, monkeypatch: pytest.MonkeyPatch) -> None:
         network = build_network(CONDITION_CHANNELS, (8, 8, 16), torch.Generator()).eval()
         gamut = Gamut.of_images(torch.rand(1, 3, 32, 32), torch.ones(1, 1, 32, 32))
