@@ -77,7 +77,8 @@ def methods_tables(cases: Sequence[dict[str, Any]]) -> str:
             for method in order
             if (times := [case["seconds"] for case in runs if case["method"] == method])
         }
-        measured = [metric for metric in METRICS if any(metric in row["figures"] for row in by_method.values())]
+        given = {name for row in by_method.values() for name in row["figures"]}
+        measured = [metric for metric in METRICS if metric in given]
         for aligned in (False, True):
             shown = [metric for metric in measured if not (aligned and metric.startswith("depth"))]
             table = []
