@@ -84,9 +84,11 @@ class PoseEstimate:
         elif found.get("lenient"):
             why = f" in a second, lenient attempt ({found['first_attempt']['registered_train']} in the first)"
         lens = "" if self.calibration is None else f"; {self.calibration.summary}"
+        warning = parallax_warning(found) if self.method == "colmap" else None
+        parallax = "" if warning is None else f"; {warning}"
         return (
             f"by {by}: {found['registered_train']} of {found['n_train']} training frames"
-            f"{why}, {found['registered_test']} of {found['n_test']} held-out frames; {self._scale}{lens}"
+            f"{why}, {found['registered_test']} of {found['n_test']} held-out frames; {self._scale}{lens}{parallax}"
         )
 
     @property

@@ -124,6 +124,12 @@ def test_a_frame_without_pose_is_named(run: Run) -> None:
     json.dumps(run.estimate.report, allow_nan=False)
 
 
+def test_the_summary_says_where_parallax_is_missing(run: Run) -> None:
+    """The plan of a page shows the summary; the log alone would be missed."""
+    turning = replace(run.estimate, report={**run.estimate.report, "triangulation_angle_deg": 0.93})
+    assert turning.summary.startswith(run.estimate.summary + "; the rays to a point differ by 0.9 degrees")
+
+
 def test_progress_runs_to_its_end(run: Run) -> None:
     steps = [event for event in run.events if isinstance(event, Progress)]
     assert {step.stage for step in steps} == {"poses"}
