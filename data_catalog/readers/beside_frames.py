@@ -20,6 +20,7 @@ __all__ = [
     "is_of_another_kind",
     "listed_files",
     "tell_about_folders",
+    "tell_about_other_names",
     "tell_about_pictures",
     "tell_what_is_not_read",
 ]
@@ -27,6 +28,8 @@ __all__ = [
 logger = logging.getLogger(__name__)
 
 _NAMED_FILES = 3
+_FEWEST_NUMBERED = 4
+_NUMBERED_PER_OTHER = 10
 _MATCHED_SHARE = 0.5
 _WORDS = re.compile(r"[A-Z]?[^\W\d_A-Z]+|[A-Z]+(?![^\W\d_A-Z])|\d+")
 _KIND = re.compile(
@@ -141,6 +144,25 @@ def tell_about_pictures(folder: Path, left_out: Sequence[Path]) -> None:
         )
 
 
+def tell_about_other_names(files: Sequence[Path]) -> None:
+    """Warn of a few frames without a number in their names, where all others have one.
+
+    Such a picture (`overview.png`) is more often about a recording than part of it. It is read nevertheless:
+    a name alone does not say what a picture shows.
+
+    Args:
+        files: the frames to read.
+    """
+    others = [file for file in files if not any(map(str.isdecimal, file.stem))]
+    numbered = len(files) - len(others)
+    if others and numbered >= max(_FEWEST_NUMBERED, _NUMBERED_PER_OTHER * len(others)):
+        _tell(
+            f"{files[0].parent}: beside {numbered} frames with a number in their names there is also "
+            f"{listed_files(others)}, which is read as a frame. Move away what is none",
+            topic="frames",
+        )
+
+
 def tell_what_is_not_read(folder: Path) -> None:
     """Warn of masks, depth and poses that lie beside frames without anything that says how they belong."""
     names = sorted(file.name for file in folder.iterdir() if not file.name.startswith("."))
@@ -185,6 +207,6 @@ def _of_sinus_set(names: Sequence[str]) -> str:
     return f"; what there is of the sinus set lacks {' and '.join(absent)}" if is_part and absent else ""
 
 
-def _tell(sentence: str) -> None:
+def _tell(sentence: str, topic: str = "not read") -> None:
     # With a topic it is a finding of `data check`: what lies there was probably meant to be read.
-    logger.warning("%s", sentence, extra={"topic": "not read", "field": "files"})
+    logger.warning("%s", sentence, extra={"topic": topic, "field": "files"})

@@ -51,6 +51,7 @@ from data_catalog.readers.beside_frames import (
     check_one_format,
     frames_among,
     listed_files,
+    tell_about_other_names,
     tell_about_pictures,
     tell_what_is_not_read,
 )
@@ -232,6 +233,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     read.check_and_tell()
     files = read.files
     tell_about_order(files[0].parent, NameOrder(file.name for file in files))
+    tell_about_other_names(files)
     views = None if read.pairs else views_in_pictures(files, config.stereo_camera)
     width, height = upright_size(files[0], frame=files[0].name)
     pixel_aspect = 1.0

@@ -88,7 +88,8 @@ class PoseEstimate:
         parallax = "" if warning is None else f"; {warning}"
         return (
             f"by {by}: {found['registered_train']} of {found['n_train']} training frames"
-            f"{why}, {found['registered_test']} of {found['n_test']} held-out frames; {self._scale}{lens}{parallax}"
+            f"{why}, {found['registered_test']} of {found['n_test']} held-out frames; "
+            f"{self._scale}{lens}{parallax}"
         )
 
     @property

@@ -77,6 +77,20 @@ class TestPicturesOfAnotherKind:
         (finding,) = not_read(tmp_path)
         assert "give a poses.json with rgb/, depth/ and mask/" in finding.sentence
 
+    @pytest.mark.parametrize(("name", "told"), [("overview.png", True), ("frame_10.png", False)])
+    def test_a_name_without_a_number_among_numbered_ones_is_told(self, tmp_path, name, told) -> None:
+        write_frames(tmp_path, 10)
+        Image.fromarray(moving_scene(1, 48, 42)[0]).save(tmp_path / name)
+        assert len(read(tmp_path).frame_names) == 11, "read nevertheless"
+        found = [finding.sentence for finding in inspect(tmp_path).findings if finding.topic == "frames"]
+        assert len(found) == told
+        assert all(f"beside 10 frames with a number in their names there is also {name}" in x for x in found)
+
+    def test_frames_without_numbers_are_not_told(self, tmp_path) -> None:
+        for name, image in zip("abcdefgh", moving_scene(8, 48, 42), strict=True):
+            Image.fromarray(image).save(tmp_path / f"{name}.png")
+        assert not [finding for finding in inspect(tmp_path).findings if finding.topic == "frames"]
+
     def test_they_do_not_count_as_images(self, tmp_path) -> None:
         """As many images in rgb/ as frames and masks together in images/ were refused."""
         write_frames(tmp_path / "images", 10)
