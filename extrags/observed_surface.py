@@ -13,6 +13,9 @@ from extrags.splits import Split
 
 __all__ = ["never_observed", "observed_by_depth", "observed_from_depth"]
 
+_ROUNDING = 1e-6
+"""Share by which a depth may differ between two ways to compute it."""
+
 
 def never_observed(
     sequence: EndoscopicSequence, frames: int | Int[np.ndarray, "n"]
@@ -41,6 +44,7 @@ def never_observed(
 
 def observed_from_depth(
     cameras: Cameras,
+    mask: Bool[np.ndarray, "f h w"],
     depth_mm: Float[np.ndarray, "f h w"],
     train: Int[np.ndarray, "n_train"],
     test: Int[np.ndarray, "n_test"],
@@ -51,12 +55,15 @@ def observed_from_depth(
 ) -> Bool[np.ndarray, "f h w"]:
     """A depth test against every training frame.
 
-    A point of a held-out frame is observed when it falls into a training image and lies no farther than
-    that image's depth (the farthest of the four pixels round it, so that rounding at slanted walls does
-    not hide it). After each held-out frame it emits progress: there are as many tests as pairs of frames.
+    A point of a held-out frame is observed when it falls into a training image, inside its mask, and lies no
+    farther than that image's depth (the farthest of the four pixels round it, so that rounding at slanted
+    walls does not hide it). After each held-out frame it emits progress: there are as many tests as pairs of
+    frames.
 
     Args:
         cameras: all frames.
+        mask: valid pixels, [F, H, W]. A training frame sees nothing outside its own, whatever depth is known
+            there; those of held-out frames are not looked at.
         depth_mm: z-depth, 0 where unknown, [F, H, W].
         train: indices of training frames.
         test: indices of held-out frames.
@@ -68,6 +75,9 @@ def observed_from_depth(
         True where observed, [F, H, W]; false in training frames and where depth is unknown.
     """
     observed = empty_stack(depth_mm.shape, bool)
+    viewmats = cameras.viewmats
+    # What a frame can see at all: most pairs of a long recording are told apart by this.
+    reach = {int(frame): float(np.where(mask[frame], depth_mm[frame], 0).max(initial=0)) for frame in train}
     for done, index in enumerate(test, start=1):
         known = depth_mm[index] > 0
         rays = pixel_rays(cameras[int(index)])[0][known]
@@ -79,8 +89,19 @@ def observed_from_depth(
             left = np.flatnonzero(~seen)
             if not left.size:
                 break
-            depth = depth_mm[other]
-            seen[left] = _in_front(points[left], cameras[int(other)], depth, tolerance_share, tolerance_mm)
+            z = points[left] @ viewmats[other, 2, :3] + viewmats[other, 2, 3]
+            farthest = reach[int(other)] * (1 + tolerance_share) + tolerance_mm
+            left = left[(z > 0) & (z <= farthest * (1 + _ROUNDING))]
+            if not left.size:
+                continue
+            seen[left] = _in_front(
+                points[left],
+                cameras[int(other)],
+                mask[other],
+                depth_mm[other],
+                tolerance_share,
+                tolerance_mm,
+            )
         observed[index][known] = seen
         emit(Progress(stage, done, len(test)))
     return observed
@@ -96,11 +117,11 @@ def observed_by_depth(
 ) -> Bool[np.ndarray, "f h w"] | None:
     """`observed_from_depth` for the frames of a split; None where there is no depth.
 
-    One of the functions that a reader of posed frames may be given: others look at a mesh, and at masks.
+    One of the functions that a reader of posed frames may be given: others look at a mesh.
 
     Args:
         cameras: all frames.
-        mask: not looked at, [F, H, W].
+        mask: valid pixels of all frames, [F, H, W].
         depth_mm: z-depth, 0 where unknown, [F, H, W].
         split: which frames train, and which are held out.
         tolerance_mm: the step of the depth's encoding.
@@ -110,18 +131,21 @@ def observed_by_depth(
     """
     if depth_mm is None:
         return None
-    return observed_from_depth(cameras, depth_mm, split.train, split.test, tolerance_mm=tolerance_mm)
+    return observed_from_depth(cameras, mask, depth_mm, split.train, split.test, tolerance_mm=tolerance_mm)
 
 
 def _in_front(
     points: Float[np.ndarray, "p 3"],
     camera: Cameras,
+    mask: Bool[np.ndarray, "h w"],
     depth_mm: Float[np.ndarray, "h w"],
     tolerance_share: float,
     tolerance_mm: float,
 ) -> Bool[np.ndarray, "p"]:
     (pixels,), (z,) = camera.project(points)
     inside = camera.contains(pixels)
+    column, row = pixels[inside].astype(np.int64).T
+    inside[inside] = mask[row, column]
     u, v = pixels[inside].T
     farthest = np.zeros(len(u))
     for dy in (-0.5, 0.5):

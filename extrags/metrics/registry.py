@@ -46,7 +46,7 @@ __all__ = [
     "unregister_metric",
 ]
 
-PROTOCOL_VERSION = 6
+PROTOCOL_VERSION = 7
 """Of the protocol in `PROTOCOL.md`; raised by hand whenever a figure could change for the same renders, or
 one is added."""
 

@@ -42,5 +42,5 @@ def observed_by_those_left(
             len(sequence.train) - len(left),
         )
         return None
-    seen = observed_from_depth(sequence.cameras, depth, left, sequence.test, stage="poses")
+    seen = observed_from_depth(sequence.cameras, sequence.mask, depth, left, sequence.test, stage="poses")
     return np.asarray(seen & sequence.observed)

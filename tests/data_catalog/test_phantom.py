@@ -69,7 +69,12 @@ class TestGroundTruth:
             assert sequence.depth_mm is not None
             assert sequence.observed is not None
             by_depth = observed_from_depth(
-                sequence.cameras, sequence.depth_mm, sequence.train, sequence.test, tolerance_share=0.02
+                sequence.cameras,
+                sequence.mask,
+                sequence.depth_mm,
+                sequence.train,
+                sequence.test,
+                tolerance_share=0.02,
             )
             agreement = (by_depth == sequence.observed)[sequence.test].mean()
             assert agreement > 0.97

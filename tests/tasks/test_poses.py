@@ -104,7 +104,7 @@ class TestDroppedTrainingFrames:
         assert before.depth_mm is not None
         assert before.observed is not None
         left = np.setdiff1d(before.train, DROPPED)
-        expected = observed_from_depth(before.cameras, before.depth_mm, left, before.test)
+        expected = observed_from_depth(before.cameras, before.mask, before.depth_mm, left, before.test)
         expected &= before.observed
         assert after.observed is not None
         np.testing.assert_array_equal(after.observed[after.test], expected[before.test])
