@@ -117,8 +117,8 @@ def benchmark(
     shows as a trend. A run that fails does not stop the others.
 
     Returns:
-        `{machine, methods: {NAME: WORDS}, cases: [{method, profile, sequence, setting, seed, settings,
-        image_size, seconds, spent_seconds, processor_seconds, peak_mib, metrics, ...}],
+        `{machine, protocol, methods: {NAME: WORDS}, cases: [{method, profile, sequence, setting, seed,
+        settings, image_size, seconds, spent_seconds, processor_seconds, peak_mib, metrics, ...}],
         comparison, regressions, not_judged, report}`; `metrics` is None for a failed run, whose `error`
         says why. `regressions` and `not_judged` are those of `flows.history.Judgement`, in words.
         `comparison` is
@@ -183,9 +183,11 @@ def benchmark(
         append_history(Store(store), accounts.entry)
     _tell(name, accounts, baseline)
     from extrags.metrics.comparison import compare_runs
+    from extrags.metrics.registry import PROTOCOL_VERSION
 
     result = {
         "machine": about,
+        "protocol": PROTOCOL_VERSION,
         "methods": words,
         "cases": accounts.cases,
         "comparison": compare_runs(accounts.cases, baseline),

@@ -13,6 +13,7 @@ from data_catalog.names import path_of
 from extrags import __version__
 from extrags.config import DEFAULT_PROFILE, PipelineConfig
 from extrags.errors import ConfigError, DamagedArtefactError, StoreError
+from extrags.metrics.registry import PROTOCOL_VERSION
 from extrags.stages import STAGES, StageName
 from extrags.store import Store, digest_of, read_records, write_record
 from extrags.store.records import remove_record
@@ -272,6 +273,7 @@ def record_outcome(
         "size": None if work is None else work.size,
         "stages": [_stage_record(row, expected.get(row.stage, 0.0)) for row in outcome.stages],
         "metrics": outcome.metrics,
+        "protocol": PROTOCOL_VERSION,
         "report": outcome.report,
         "extrags": __version__,
     }

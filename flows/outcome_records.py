@@ -29,10 +29,11 @@ REPORT = "report-v"
 
 OutcomeRecord = dict[str, Any]
 """`{sequence, path, method, profile, seed, variant, settings, until, status, stage, reason, ended, seconds,
-config, size, stages, metrics, report, extrags}` of the last run of a case that came to an end.
+config, size, stages, metrics, protocol, report, extrags}` of the last run of a case that came to an end.
 
 `path` is the absolute one of a sequence that is a path, else None, `settings` are those that were given
-(records of earlier versions lack both), and the size is that of `extrags.run_costs.Workload`. Of each stage
+(records of earlier versions lack both, and `protocol`, the version of the evaluation's), and the size is
+that of `extrags.run_costs.Workload`. Of each stage
 `{stage, state, reason, made_seconds, expected_cpu_s, artefacts: {KEY: BYTES}}`: seconds that it took, and
 those of processor time that the cost model expects on its reference machine."""
 

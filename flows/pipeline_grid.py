@@ -175,13 +175,14 @@ def run_grid(
         run: what runs a cell; `in_own_process` by default.
 
     Returns:
-        `{format, machine, sharing, cases, cells, fronts}`; `cases` as of `run_cell`, `cells` their means
-        (`extrags.metrics.fronts.means_by_cell`), `fronts` as of `extrags.metrics.fronts.fronts`.
+        `{format, machine, protocol, sharing, cases, cells, fronts}`; `cases` as of `run_cell`, `cells` their
+        means (`extrags.metrics.fronts.means_by_cell`), `fronts` as of `extrags.metrics.fronts.fronts`.
 
     Raises:
         ConfigError: when the folder holds a grid of another machine, version or way of sharing.
     """
     from extrags.metrics.fronts import fronts, means_by_cell
+    from extrags.metrics.registry import PROTOCOL_VERSION
     from extrags.raster.bench import machine
 
     about = machine()
@@ -207,6 +208,7 @@ def run_grid(
     return {
         "format": FORMAT,
         "machine": about,
+        "protocol": PROTOCOL_VERSION,
         "sharing": "none: a store for each cell"
         if separate
         else "stages that cells of a repeat have in common were made once; every cell is charged their time",

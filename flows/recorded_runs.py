@@ -356,6 +356,7 @@ def board_rows(store: Store, patterns: Sequence[str] = (), target: str = "") -> 
                 ended=str(record["ended"]),
                 seconds=sum(float(stage["made_seconds"]) for stage in record["stages"]),
                 metrics=tree.get("final") or tree.get("coarse"),
+                protocol=record.get("protocol"),
                 held_out_trained_on=held_out_trained_on(record),
                 link="" if page is None else _address(page, target),
             )

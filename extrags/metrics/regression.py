@@ -78,12 +78,15 @@ def compare_results(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict
         after: of what is judged.
 
     Returns:
-        `{level, times_judged, rows, failed, missing, regressions}`. A row has what its runs share, the
-        quantity, means, the worsening (share of a cost or figure, or dB; `absolute`, in its own unit, of what
-        was 0; positive is worse), its 95 % interval and a verdict: `worse`, `better`, `noise`, `equal`, or
-        `not judged` where a single pair says nothing about noise. `failed` names groups of runs that fail
-        now and did not; `missing` those that are not in `after`, wholly or with a seed or repeat, and
-        figures that no run there has any more. Times and memory are judged on one kind of machine only.
+        `{level, times_judged, protocols, rows, failed, missing, regressions}`. A row has what its runs
+        share, the quantity, means, the worsening (share of a cost or figure, or dB; `absolute`, in its own
+        unit, of what was 0; positive is worse), its 95 % interval and a verdict: `worse`, `better`, `noise`,
+        `equal`, or `not judged` where a single pair says nothing about noise. `failed` names groups of
+        runs that fail now and did not; `missing` those that are not in `after`, wholly or with a seed or
+        repeat, and figures that no run there has any more. Times and memory are judged on one kind of
+        machine only, figures by one version of the evaluation protocol: of another, the same renders may have
+        other ones.
+        `protocols` has both versions, null for results that say none, whose figures are judged.
         `regressions` has the rows that are worse, and what fails or is missing, in words.
 
     Raises:
@@ -98,6 +101,8 @@ def compare_results(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict
     same = all(
         (before.get("machine") or {}).get(key) == (after.get("machine") or {}).get(key) for key in MACHINE
     )
+    protocols = [_protocol(document) for document in (before, after)]
+    one_protocol = None in protocols or protocols[0] == protocols[1]
     rows: list[_Row] = []
     failed = []
     missing = [f"{_label(group)} was not run" for group in sides[0] if group not in sides[1]]
@@ -105,20 +110,28 @@ def compare_results(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict
         was, now = (side[group] for side in sides)
         if (error := _new_failure(was, now)) is not None:
             failed.append(f"{_label(group)} fails: {error}")
-        rows += _rows(group, was, now, costs=same)
+        rows += _rows(group, was, now, costs=same, with_figures=one_protocol)
         if gone := _gone(was, now):
             missing.append(f"{_label(group)} was not run with {'; '.join(gone)}")
-        missing += [f"{_label(group)} has no {name}" for name in _lost(was, now)]
+        if one_protocol:
+            missing += [f"{_label(group)} has no {name}" for name in _lost(was, now)]
     _judge(rows)
     worse = [_words(row) for row in rows if row.verdict == "worse"]
     return {
         "level": LEVEL,
         "times_judged": same,
+        "protocols": protocols,
         "rows": [row.to_json() for row in rows],
         "failed": failed,
         "missing": missing,
         "regressions": [*failed, *missing, *worse],
     }
+
+
+def _protocol(document: Mapping[str, Any]) -> int | None:
+    """Version of the protocol that figures were measured by; None of results that do not say it."""
+    found = document.get("protocol")
+    return found if isinstance(found, int) else None
 
 
 def _cases(document: Mapping[str, Any], which: str) -> list[Mapping[str, Any]]:
@@ -224,13 +237,19 @@ def _lost(was: Sequence[Mapping[str, Any]], now: Sequence[Mapping[str, Any]]) ->
 
 
 def _rows(
-    group: tuple[Any, ...], was: Sequence[Mapping[str, Any]], now: Sequence[Mapping[str, Any]], *, costs: bool
+    group: tuple[Any, ...],
+    was: Sequence[Mapping[str, Any]],
+    now: Sequence[Mapping[str, Any]],
+    *,
+    costs: bool,
+    with_figures: bool,
 ) -> list[_Row]:
     about = dict(zip(GROUP, group, strict=True))
     wanted: list[tuple[str, str, Figure | None]] = []
     if costs:
         wanted += [(name, "cost", None) for name in COST_NAMES]
-    wanted += [(figure.name, "dB" if figure.unit == "dB" else "other", figure) for figure in figures()]
+    if with_figures:
+        wanted += [(figure.name, "dB" if figure.unit == "dB" else "other", figure) for figure in figures()]
     found = []
     for name, kind, figure in wanted:
         sides = [_values(runs, name, figure) for runs in (was, now)]

@@ -34,6 +34,7 @@ class BoardRow:
         seconds: its stages took.
         metrics: of the final scene, as the `metrics` of an `EvaluationResult`; None without.
         link: address of its page; empty for none.
+        protocol: version of the evaluation protocol that the metrics are by; None for records that lack it.
         held_out_trained_on: its scene has seen the frames that its figures are of.
     """
 
@@ -49,6 +50,7 @@ class BoardRow:
     seconds: float | int = 0.0
     metrics: Mapping[str, Any] | None = None
     link: str = ""
+    protocol: int | None = None
     held_out_trained_on: bool = False
 
     @property
@@ -128,6 +130,15 @@ def _warnings(rows: Sequence[BoardRow]) -> list[str]:
     if columns := _distinct(row.column for row in rows if row.held_out_trained_on):
         found.append(
             f"Held-out frames were trained on in {', '.join(columns)}, which is never marked as best."
+        )
+    protocols = {row.protocol for row in rows if row.metrics is not None}
+    if len(protocols) > 1:
+        known = ", ".join(str(version) for version in sorted(item for item in protocols if item is not None))
+        unknown = " and of earlier ones that are not on record" if None in protocols else ""
+        found.append(
+            f"Figures are of several versions of the evaluation protocol ({known}{unknown}): some of them "
+            "cannot be compared. Runs of the older ones, started again, are measured anew without being made "
+            "anew."
         )
     if len({row.further for row in rows}) > 1:
         found.append(

@@ -21,8 +21,8 @@ def add_arguments(parser: Parser) -> None:
         "where there are such, else the two samples. A difference is a regression when it matters (costs "
         "5 %, 0.1 dB, other figures 1 %) and is beyond noise (t test, Holm's correction over all that is "
         "compared, 5 %); it takes two or more seeds, or repeats for costs. Times and memory are judged on "
-        "one kind of machine only. Exit code 1 on a regression, or when runs fail that did not, or runs or "
-        "figures are gone."
+        "one kind of machine only, figures by one version of the evaluation protocol only. "
+        "Exit code 1 on a regression, or when runs fail that did not, or runs or figures are gone."
     )
     parser.add_argument("before", type=Path, metavar="A.json", help="the reference")
     parser.add_argument("after", type=Path, metavar="B.json", help="what is judged")
@@ -85,6 +85,12 @@ def _print(found: dict[str, Any], *, every: bool) -> None:
         out.print(line, markup=False, soft_wrap=True)
     if not found["times_judged"]:
         out.print("times and memory are not judged: the results are of different machines")
+    before, after = found["protocols"]
+    if None not in (before, after) and before != after:
+        out.print(
+            f"figures are not judged: they are of versions {before} and {after} of the evaluation protocol",
+            soft_wrap=True,
+        )
     told = ", ".join(f"{count} {verdict}" for verdict, count in sorted(counts.items()))
     out.print(f"compared: {told}", soft_wrap=True)
     if counts.get("not judged"):

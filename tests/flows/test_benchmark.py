@@ -13,6 +13,7 @@ from prefect.artifacts import Artifact
 
 from extrags.config import profile_config
 from extrags.errors import ConfigError
+from extrags.metrics.registry import PROTOCOL_VERSION
 from extrags.store import Store
 from flows.benchmark import Case, benchmark, check_methods, run_method, summary_of
 from flows.commands.benchmark import print_benchmark
@@ -46,6 +47,7 @@ def found(finished: tuple[str, SequenceOutcome], prefect_server: None) -> dict[s
 class TestRuns:
     def test_a_case_for_each_combination(self, found: dict[str, Any]) -> None:
         assert {"processor", "cores", "threads", "versions", "commit"} <= set(found["machine"])
+        assert found["protocol"] == PROTOCOL_VERSION
         identities = [(case["method"], case["seed"]) for case in found["cases"]]
         assert identities == [(method, seed) for seed in (0, 1) for method in ("3dgs", "coarse", "no-light")]
         case = found["cases"][0]

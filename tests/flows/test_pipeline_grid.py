@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 
 from extrags.errors import ConfigError
+from extrags.metrics.registry import PROTOCOL_VERSION
 from extrags.restoration.diffusion.weights import COLONS, starting_weights
 from flows.budgets import Budget
 from flows.cli import main
@@ -79,6 +80,7 @@ class TestGrid:
         assert second["peak_mib"] > 0
         assert (first["width"], first["height"], first["frames"]) == (48, 40, 8)
         assert found["machine"]["versions"]["extrags"]
+        assert found["protocol"] == PROTOCOL_VERSION
         assert {entry["figure"] for entry in found["fronts"]} >= {"psnr", "ssim"}
         # What is finished is not run again.
         again = run_grid(cells(), tmp_path, run=_never)

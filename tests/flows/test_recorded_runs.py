@@ -14,6 +14,7 @@ import pytest
 from data_catalog.catalog import describe
 from extrags import __version__
 from extrags.errors import ConfigError, StoreError
+from extrags.metrics.registry import PROTOCOL_VERSION
 from extrags.pipeline import HELD_OUT_TRAINED_ON
 from extrags.sequence import EndoscopicSequence
 from extrags.store import Manifest, Store, write_record
@@ -145,6 +146,7 @@ def test_rows_of_the_leaderboard(store: Store) -> None:
         ("report.held_out_views = 2", ""),
     ]
     assert rows[1].metrics is not None
+    assert rows[1].protocol == PROTOCOL_VERSION
     assert rows[1].link.startswith("file://")
     assert board_rows(store, ["c3vd/*"]) == []
     assert len(board_rows(store, ["phantom/*"])) == 3

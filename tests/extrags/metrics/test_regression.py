@@ -89,6 +89,21 @@ class TestVerdicts:
         assert not found["times_judged"]
         assert set(verdicts(found)) == {"psnr"}
 
+    def test_figures_of_two_versions_of_the_protocol_are_not_judged(self) -> None:
+        before = result() | {"protocol": 6}
+        after = result(worse_db=4, slower=2) | {"protocol": 7}
+        # A figure that is gone went with its version.
+        for case in before["cases"]:
+            case["metrics"]["ssim"] = 0.9
+        found = compare_results(before, after)
+        assert found["protocols"] == [6, 7]
+        assert verdicts(found) == {"seconds": "worse"}
+        assert not found["missing"]
+        # Results that do not say their version are from before it was said.
+        found = compare_results(result(), after)
+        assert found["protocols"] == [None, 7]
+        assert verdicts(found)["psnr"] == "worse"
+
 
 @pytest.mark.parametrize("seeds", [*(pytest.param(few, marks=pytest.mark.slow) for few in (2, 3)), 5])
 def test_few_false_alarms_among_many_quantities(seeds: int) -> None:

@@ -82,6 +82,19 @@ def test_further_settings_stand_with_each_run() -> None:
     assert "Not all runs" not in same.text
 
 
+def test_several_versions_of_the_protocol_are_told_of() -> None:
+    told = "Figures are of several versions of the evaluation protocol"
+    assert told not in Page(build_leaderboard(ROWS)).text
+    newer = [replace(item, protocol=7) for item in ROWS]
+    assert told not in Page(build_leaderboard(newer)).text
+    mixed = Page(build_leaderboard([replace(ROWS[0], protocol=6), *newer[1:]])).text
+    assert f"{told} (6, 7)" in mixed
+    assert (
+        f"{told} (7 and of earlier ones that are not on record)"
+        in Page(build_leaderboard([ROWS[0], *newer[1:]])).text
+    )
+
+
 @pytest.mark.parametrize(
     ("sequence", "dataset"),
     [
