@@ -249,8 +249,10 @@ def _ceiling(
                 whole, part = (gains(members, name, figure) for name in (CEILING, method))
                 by_sequence: dict[Any, list[tuple[float, float]]] = {}
                 partners: dict[Any, list[Run]] = {}
-                for key in part.keys() & whole.keys():
-                    run, gain = part[key]
+                # In the order of the runs: that of a set differs from process to process, and so do sums.
+                for key, (run, gain) in part.items():
+                    if key not in whole:
+                        continue
                     sequence = (run["sequence"], run["setting"])
                     by_sequence.setdefault(sequence, []).append((gain, whole[key][1]))
                     partners.setdefault(sequence, []).append(run)

@@ -183,6 +183,16 @@ class TestCeiling:
         (first, *_) = compare_runs(runs, "3dgs")["ceiling_sequences"]
         assert (first["figures"]["psnr"]["low"], first["figures"]["psnr"]["high"]) == (None, None)
 
+    def test_seeds_are_summed_in_the_order_of_the_runs(self) -> None:
+        """Another order has other last bits, and that of a set of names differs from process to process."""
+        gains = [1e16, 3.0, -1e16, 5.0] * 3
+        runs = []
+        for seed, gain in enumerate(gains):
+            for method, value in (("3dgs", 0.0), ("coarse", gain), ("oracle", 1.0)):
+                runs.append(run(method, "phantom/0", seed, value))
+        (row,) = compare_runs(runs, "3dgs")["ceiling_sequences"]
+        assert row["figures"]["psnr"]["mean"] == np.mean(np.array([gains, [1.0] * 12]).T, axis=0)[0]
+
     def test_without_an_oracle_there_is_none(self) -> None:
         comparison = compare_runs(both("phantom/0", 0, 20.0, 1.0), "3dgs")
         assert comparison["ceiling_sequences"] == comparison["ceiling_datasets"] == []
