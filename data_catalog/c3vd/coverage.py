@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Int
 from data_catalog.ray_casting import RayCaster
 from extrags.cameras import Cameras, compose, pixel_rays
 from extrags.errors import SourceError, SourceNotFoundError
-from extrags.frame_stacks import empty_stack
+from extrags.frame_stacks import empty_stack, frames_of
 
 __all__ = ["Alignment", "CoverageMesh", "Surface", "align", "read_coverage_mesh"]
 
@@ -202,10 +202,12 @@ class Surface:
             False in training frames, and where a pixel's ray meets no surface.
         """
         observed = empty_stack(mask.shape, bool)
+        # Once: masks of a long recording are gigabytes.
+        seeing, valid = cameras[train], frames_of(mask, train)
         for index in test:
             depth, _ = self.z_depth(cameras[int(index)])
             met = np.isfinite(depth)
             rays = pixel_rays(cameras[int(index)])[0][met]
             points = cameras.centers[index] + rays * depth[met][:, None].astype(np.float64)
-            observed[index][met] = self._rays.seen_by(points, cameras[train], mask[train])
+            observed[index][met] = self._rays.seen_by(points, seeing, valid)
         return observed

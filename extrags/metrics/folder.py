@@ -20,6 +20,7 @@ from jaxtyping import Float
 from extrags.array_files import load_npy
 from extrags.errors import ConfigError, NonFiniteError, ShapeError, SourceError, SourceNotFoundError
 from extrags.frame_names import NameOrder, tell_about_order
+from extrags.frame_stacks import stacked
 from extrags.metrics.protocol import RenderedViews
 from extrags.sequence import EndoscopicSequence
 
@@ -62,14 +63,17 @@ def read_renders(
     if depth_step_mm is not None and not 0 < depth_step_mm < math.inf:
         raise ConfigError(f"a step of depth of {depth_step_mm} mm; expected a length above zero")
     shape = (sequence.height, sequence.width)
-    rgb = [_color(file, shape) for file in _files_of(folder, sequence, COLOR_SUFFIXES, "image", not_measured)]
-    depth = np.zeros((len(rgb), *shape), dtype=np.float32)
+    # One view at a time: held-out views may be hundreds, of full size.
+    files = _files_of(folder, sequence, COLOR_SUFFIXES, "image", not_measured)
+    rgb = stacked((_color(file, shape) for file in files), len(files))
+    everywhere = (len(files), *shape)
+    depth = np.broadcast_to(np.float32(0), everywhere)
     if depth_folder is not None:
-        files = _files_of(depth_folder, sequence, DEPTH_SUFFIXES, "depth map", not_measured)
-        depth = np.stack([_depth(file, shape, depth_step_mm) for file in files])
+        maps = _files_of(depth_folder, sequence, DEPTH_SUFFIXES, "depth map", not_measured)
+        depth = stacked((_depth(file, shape, depth_step_mm) for file in maps), len(maps))
     return RenderedViews(
-        np.stack(rgb),
-        np.ones((len(rgb), *shape), dtype=np.float32),
+        rgb,
+        np.broadcast_to(np.float32(1), everywhere),
         depth,
         None,
         has_depth=depth_folder is not None,

@@ -7,6 +7,7 @@ from jaxtyping import Int
 
 from extrags.baselines.uc_nerf.scene import UcNerf
 from extrags.events import Progress, emit
+from extrags.frame_stacks import empty_stack
 from extrags.metrics.protocol import RenderedViews
 from extrags.metrics.surface import PROTOCOL_FUSION, surface_from_renders
 from extrags.sequence import EndoscopicSequence
@@ -30,11 +31,7 @@ def render(
     """
     frames = np.asarray(sequence.test if frames is None else frames)
     shape = (len(frames), sequence.height, sequence.width)
-    rgb, alpha, depth = (
-        np.zeros((*shape, 3), np.float32),
-        np.zeros(shape, np.float32),
-        np.zeros(shape, np.float32),
-    )
+    rgb, alpha, depth = (empty_stack(size, np.float32) for size in ((*shape, 3), shape, shape))
     encoded, sources = scene.encoded(), _sources(sequence)
     for place, frame in enumerate(frames):
         found = scene.render(sequence.cameras[int(frame)], encoded, leave_out=sources.get(int(frame)))
@@ -56,7 +53,7 @@ def surface(scene: UcNerf, sequence: EndoscopicSequence) -> Mesh | None:
     """
     frames = np.unique(np.concatenate([sequence.train, sequence.test]))
     cameras = sequence.cameras[frames].at_most_width(PROTOCOL_FUSION.max_width)
-    depth = np.zeros((len(cameras), cameras.height, cameras.width), np.float32)
+    depth = empty_stack((len(cameras), cameras.height, cameras.width), np.float32)
     encoded, sources = scene.encoded(), _sources(sequence)
     for place, frame in enumerate(frames):
         found = scene.render(cameras[place], encoded, color=False, leave_out=sources.get(int(frame)))

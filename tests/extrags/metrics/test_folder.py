@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from extrags import frame_stacks
 from extrags.errors import ConfigError, NonFiniteError, ShapeError, SourceError, SourceNotFoundError
 from extrags.metrics.folder import _color, read_renders
 from extrags.metrics.protocol import RenderedViews, evaluate_views
@@ -46,6 +47,24 @@ def test_names_decide_whatever_the_order(sequence: EndoscopicSequence, tmp_path:
     np.testing.assert_array_equal(np.rint(renders.rgb * 255), LEVELS[TEST])
     assert evaluate_views(renders, sequence, TEST, None).metrics["psnr"] == 100
     assert renders.n_gaussians is None
+
+
+def test_many_large_views_are_not_held_in_memory(
+    sequence: EndoscopicSequence, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = write(tmp_path / "renders", {f"b_{index:04d}.png": LEVELS[index] for index in TEST})
+    (tmp_path / "depth").mkdir()
+    for index in TEST:
+        np.save(tmp_path / "depth" / f"b_{index:04d}.npy", np.full((HEIGHT, WIDTH), 20, np.float32))
+    monkeypatch.setattr(frame_stacks, "MAPPED_BYTES", 0)
+    renders = read_renders(folder, sequence, depth_folder=tmp_path / "depth")
+    assert isinstance(renders.rgb.base, np.memmap)
+    assert isinstance(renders.depth_mm.base, np.memmap)
+    # What is the same everywhere takes no room.
+    bare = read_renders(folder, sequence)
+    assert renders.alpha.strides == bare.alpha.strides == bare.depth_mm.strides == (0, 0, 0)
+    for found, error in ((renders, 0.0), (bare, None)):
+        assert evaluate_views(found, sequence, TEST, None).metrics["depth_absrel"] == error
 
 
 def test_hidden_files_are_none_of_them(sequence: EndoscopicSequence, tmp_path: Path) -> None:
