@@ -19,6 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from extrags import __version__
 from extrags.errors import ExtragsError
 from extrags.metrics.comparison import figure_of
+from extrags.metrics.registry import PROTOCOL_VERSION
 from extrags.store import Store, digest_of, read_records, write_record
 
 __all__ = [
@@ -117,6 +118,7 @@ def history_entry(
         "when": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "commit": machine["commit"],
         "version": __version__,
+        "protocol": PROTOCOL_VERSION,
         "machine": {key: machine[key] for key in (*SAME_MACHINE, "load_average")},
         "cases": [
             {
@@ -168,10 +170,11 @@ def judge(entry: Mapping[str, Any], earlier: Sequence[Mapping[str, Any]], tolera
     """Hold a run against those before.
 
     Compared is the mean over seeds of each method on each sequence, with the median of the last
-    `tolerance.runs` runs that did not fail, asked for the same settings and had these seeds: PSNR of all of
-    them, run time of those on the same kind of machine. Run time is processor time where enough of these runs
-    have measured it, since other work on the machine hardly changes it; elapsed time otherwise. A case that
-    fails is worse, too, until it is mended.
+    `tolerance.runs` runs that did not fail, asked for the same settings and had these seeds: PSNR of those
+    that are of the same version of the evaluation protocol, or do not say theirs, run time of those on the
+    same kind of machine. Run time is processor time where enough of these runs have measured it, since other
+    work on the machine hardly changes it; elapsed time otherwise. A case that fails is worse, too, until it
+    is mended.
 
     Args:
         entry: of the run.
@@ -182,6 +185,7 @@ def judge(entry: Mapping[str, Any], earlier: Sequence[Mapping[str, Any]], tolera
     remark = f"of {len(earlier)} earlier runs comparable (at least {tolerance.at_least})"
     before = [_comparable(item, entry) for item in earlier]
     same = [_same_machine(item, entry) for item in earlier]
+    alike = [item.get("protocol") in (None, entry.get("protocol")) for item in earlier]
     for group, now in _comparable(entry, entry).items():
         label = _label(group)
         past = [groups[group] for groups in before if group in groups]
@@ -194,7 +198,11 @@ def judge(entry: Mapping[str, Any], earlier: Sequence[Mapping[str, Any]], tolera
                 found.not_judged.append(f"{label}: failure, {len(good)} {remark}")
             continue
         name = next((figure for figure in FIGURES if figure in now["figures"]), None)
-        known = [item["figures"][name] for item in good if name in item["figures"]]
+        measured = [
+            groups[group] for groups, mine in zip(before, alike, strict=True) if mine and group in groups
+        ]
+        measured = [item for item in measured if not item["error"]][-tolerance.runs :]
+        known = [item["figures"][name] for item in measured if name in item["figures"]]
         if tolerance.psnr_db is not None and len(known) < tolerance.at_least:
             found.not_judged.append(f"{label}: {name or 'PSNR'}, {len(known)} {remark}")
         elif tolerance.psnr_db is not None:

@@ -93,6 +93,19 @@ class TestRegressions:
         assert len(found) == len(worse)
         assert all(line.startswith(begin) for line, begin in zip(found, worse, strict=True))
 
+    def test_figures_of_another_version_of_the_protocol_are_not_compared(self) -> None:
+        worse = entry(psnr=10, seconds=900)
+        older = [{**item, "protocol": worse["protocol"] - 1} for item in BEFORE]
+        found = judge(worse, older, Tolerance())
+        (slower,) = found.regressions
+        assert slower.startswith("coarse (quick) on phantom/0@sparse: 900.5 s")
+        assert found.not_judged == [
+            "coarse (quick) on phantom/0@sparse: observed.psnr, 0 of 5 earlier runs comparable (at least 2)"
+        ]
+        # Runs from before it was on record are compared.
+        silent = [{key: value for key, value in item.items() if key != "protocol"} for item in BEFORE]
+        assert len(judge(worse, silent, Tolerance()).regressions) == 2
+
     def test_nothing_is_judged_by_a_single_run(self) -> None:
         assert judge(entry(psnr=10, seconds=900), BEFORE[:1], Tolerance()).regressions == []
         assert judge(entry(psnr=10), BEFORE[:1], Tolerance(at_least=1)).regressions != []
