@@ -203,7 +203,9 @@ def evaluate_surface(mesh: Mesh | None, truth: TrueSurface, sequence: Endoscopic
     points = sample_surface(truth.mesh, N_SAMPLES, seed=_SEED)
     # Its tree is most of what looking at a few thousand points costs.
     true_scene = _ray_scene(truth.mesh)
-    observed, unobserved = _parts(points, true_scene, sequence)
+    # It takes two passes over all depth, which of a long recording is gigabytes.
+    far = _max_fused_depth(sequence)
+    observed, unobserved = _parts(points, true_scene, sequence, far)
     found = np.zeros((0, 3))
     found_observed = found_unobserved = np.zeros(0, dtype=bool)
     to_truth = np.zeros(0)
@@ -211,7 +213,7 @@ def evaluate_surface(mesh: Mesh | None, truth: TrueSurface, sequence: Endoscopic
     if mesh is not None and _areas(mesh).sum() > 0:
         found = sample_surface(mesh, N_SAMPLES, seed=_SEED + 1)
         to_truth, nearest = _nearest(found, true_scene)
-        found_observed, found_unobserved = _parts(nearest, true_scene, sequence)
+        found_observed, found_unobserved = _parts(nearest, true_scene, sequence, far)
         to_mesh, _ = distance_to_surface(points, mesh)
     threshold = _threshold(sequence)
     counted = observed | unobserved
@@ -375,10 +377,9 @@ def _fused(cameras: Cameras, depth_mm: Float[np.ndarray, "c h w"]) -> Mesh:
 
 
 def _parts(
-    points: Float[np.ndarray, "n 3"], true_scene: Any, sequence: EndoscopicSequence
+    points: Float[np.ndarray, "n 3"], true_scene: Any, sequence: EndoscopicSequence, far: float
 ) -> tuple[Bool[np.ndarray, "n"], Bool[np.ndarray, "n"]]:
-    """Which true points training cameras see, and which held-out cameras alone."""
-    far = _max_fused_depth(sequence)
+    """Which true points training cameras see no farther than `far`, and which held-out cameras alone."""
 
     def by(frames: np.ndarray) -> Bool[np.ndarray, "n"]:
         return _seen(points, true_scene, sequence.cameras[frames], frames_of(sequence.mask, frames), far)
