@@ -21,6 +21,7 @@ from extrags.known_depth import FARTHEST, is_background
 from extrags.sequence import EndoscopicSequence
 from extrags.sparse_depth import MIN_POINTS_PER_VIEW, interpolated_depth, pixel_lattice
 from extrags.training.random_start import depth_range, random_depth
+from extrags.training.surest_depth import surest_points
 
 __all__ = [
     "LEAST_COLOR",
@@ -112,8 +113,9 @@ def starting_gaussians(
     """Gaussians from back-projected depth, from sparse points without depth, or at random without either.
 
     Unsure pixels of estimated depth beside sure ones start none: where depth jumps, an estimate lies between
-    both surfaces, and Gaussians there would hang in front of what was never seen. Nor do backgrounds
-    (`extrags.known_depth`), which a warning counts.
+    both surfaces, and Gaussians there would hang in front of what was never seen. Nor do estimates of what
+    another frame knows much better (`extrags.training.surest_depth`), or backgrounds (`extrags.known_depth`),
+    which a warning counts.
 
     Each point carries the mean albedo of its pixels: the colour with light and response divided out.
     Radii follow the distance to the three nearest neighbours. Random points lie in the cameras' frusta; they
@@ -137,9 +139,11 @@ def starting_gaussians(
     at_random = starts_at_random(sequence, frames)
     depth = _random_depth(sequence, cameras, seed) if at_random else _starting_depth(sequence, frames)
     chosen, z = _starting_pixels(sequence, frames, depth, where, max_points, seed)
-    rays = rays_of_pixels(cameras, chosen)
-    view = chosen // (sequence.width * sequence.height)
-    points = cameras.centers[view] + z[:, None] * rays
+    points, rays, view = _back_projected(cameras, chosen, z)
+    if sequence.depth_error is not None and _depth_known(sequence, frames):
+        error = _of_frames(sequence.depth_error, frames).reshape(-1)[chosen] * z
+        surest = surest_points(points, error, sequence, frames)
+        chosen, z, points, rays, view = (part[surest] for part in (chosen, z, points, rays, view))
     rgb = _of_frames(sequence.rgb, frames).reshape(-1, 3)[chosen].astype(np.float64) / 255
     if light is not None:
         local = np.einsum("nji,nj->ni", cameras.world_from_camera[view, :3, :3], z[:, None] * rays)
@@ -206,6 +210,15 @@ def _starting_pixels(
         )
         chosen, z = chosen[~background], z[~background]
     return chosen, z
+
+
+def _back_projected(
+    cameras: Cameras, chosen: Int[np.ndarray, "n"], z: Float[np.ndarray, "n"]
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], Int[np.ndarray, "n"]]:
+    """Points at flat positions of pixels, the rays to them in world axes, and whose pixels they are."""
+    rays = rays_of_pixels(cameras, chosen)
+    view = chosen // (cameras.width * cameras.height)
+    return cameras.centers[view] + z[:, None] * rays, rays, view
 
 
 def _spacing(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
