@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -175,7 +176,7 @@ class Gaussians:
         return cls(**{f.name: torch.from_numpy(read_array(group, f.name)) for f in fields(cls)})
 
     def for_file(self, path: Path) -> Gaussians:
-        """A copy as writers of files take it: on the processor, without gradient history.
+        """As writers of files take them: on the processor, without gradient history; no copy where they are.
 
         Args:
             path: file to write, for the error message.
@@ -192,13 +193,17 @@ class Gaussians:
                 raise NonFiniteError(
                     f"{name} of {wrong} of {len(self)} Gaussians hold NaN or infinity; {path} is not written"
                 )
-        return self.detached().to("cpu")
+        return Gaussians(**{name: value.detach().to("cpu") for name, value in self.parameters().items()})
 
-    def write_ply(self, path: Path) -> None:
+    def write_ply(self, path: Path, *, comments: Sequence[str] = ()) -> None:
         """Write the PLY format of 3DGS (opens in SuperSplat and brush); from any device.
 
         Colours are written as stored. In a scene with near-field light they are albedo, so a viewer does not
         show the brightness of the recording unless the light was baked into the colours before.
+
+        Args:
+            path: file to write.
+            comments: lines of the header, of ASCII.
 
         Raises:
             CaptureError: when there are no Gaussians.
@@ -228,7 +233,7 @@ class Gaussians:
         for name, column in columns.items():
             table[name] = column
         with whole_file(path) as partial:
-            PlyData([PlyElement.describe(table, "vertex")]).write(str(partial))
+            PlyData([PlyElement.describe(table, "vertex")], comments=comments).write(str(partial))
 
     @classmethod
     def read_ply(cls, path: Path) -> Gaussians:
