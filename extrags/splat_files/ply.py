@@ -17,12 +17,11 @@ import torch
 from extrags.errors import SourceError
 from extrags.gaussians import Gaussians
 from extrags.illumination import INITIAL_ROUGHNESS, NearFieldLight
-from extrags.output_files import whole_file
 from extrags.scene import Scene
 
 __all__ = ["read_ply_scene", "write_ply_scene"]
 
-_MARK = b"comment extrags_light "
+_MARK = "extrags_light "
 _LINE_BYTES = 200
 _BY_VALUE = ("exponent", "shoulder", "specular")
 """Written as they are, not as logarithms: light without fall-off has an exponent of zero, a linear response a
@@ -49,15 +48,10 @@ def write_ply_scene(scene: Scene, path: Path) -> None:
     for name in _BY_VALUE:
         values[name] = math.exp(values.pop(f"log_{name}"))
     values["reference_distance"] = scene.light.reference_distance
-    text = json.dumps(values, allow_nan=False, separators=(",", ":")).encode("ascii")
+    text = json.dumps(values, allow_nan=False, separators=(",", ":"))
     # In several lines: readers keep a line of the header in a buffer of about a thousand bytes.
-    parts = (text[start : start + _LINE_BYTES] for start in range(0, len(text), _LINE_BYTES))
-    lines = b"".join(_MARK + part + b"\n" for part in parts)
-    with whole_file(path) as partial:
-        # Looked at before, so that errors name the file itself.
-        gaussians.for_file(path).write_ply(partial)
-        head, end, body = partial.read_bytes().partition(b"element vertex")
-        partial.write_bytes(head + lines + end + body)
+    starts = range(0, len(text), _LINE_BYTES)
+    gaussians.write_ply(path, comments=[_MARK + text[start : start + _LINE_BYTES] for start in starts])
 
 
 def _with_rotations(gaussians: Gaussians) -> Gaussians:
@@ -78,7 +72,8 @@ def read_ply_scene(path: Path) -> Scene:
     gaussians = Gaussians.read_ply(path)
     with path.open("rb") as stream:
         header = stream.read(_HEADER_BYTES).partition(b"end_header")[0]
-    parts = [line.removeprefix(_MARK) for line in header.splitlines() if line.startswith(_MARK)]
+    mark = f"comment {_MARK}".encode("ascii")
+    parts = [line.removeprefix(mark) for line in header.splitlines() if line.startswith(mark)]
     return Scene(gaussians, _light(b"".join(parts), path) if parts else None)
 
 

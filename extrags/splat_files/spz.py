@@ -38,6 +38,8 @@ _REST = {0: 0, 1: 3, 2: 8, 3: 15}
 """SH coefficients above degree 0, by degree."""
 _LARGEST_COUNT = 10_000_000
 _QUAT_MAX = 511
+_COMPRESSION = 6
+"""As the format's own tools have it. The highest level takes seven times as long for 0.6 % fewer bytes."""
 _FLIPPED = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], dtype=np.float32)
 """Signs of SH coefficients 1 to 15 under half a turn about x: those odd in (y, z) together change."""
 
@@ -78,13 +80,13 @@ def write_spz(gaussians: Gaussians, path: Path) -> None:
     shN = gaussians.shN.numpy() * _FLIPPED[: gaussians.shN.shape[1], None]
     harmonics = np.rint(shN * 128 + 128)
     # Steps of 8 for degree 1, of 16 above: gzip does the rest.
-    step = np.where(np.arange(shN.shape[1]) < 3, 8, 16)[:, None]
+    step = np.where(np.arange(shN.shape[1]) < 3, np.float32(8), np.float32(16))[:, None]
     harmonics = _bytes(np.floor((harmonics + step / 2) / step) * step)
     header = _HEADER.pack(_MAGIC, 3, n, gaussians.sh_degree, bits, 0, 0)
     content = [positions, opacities, colors, scales, packed.astype("<u4"), harmonics]
     body = b"".join(np.ascontiguousarray(part).tobytes() for part in content)
     # No time stamp: the same scene gives the same file.
-    write_file(path, gzip.compress(header + body, mtime=0))
+    write_file(path, gzip.compress(header + body, _COMPRESSION, mtime=0))
 
 
 def read_spz(path: Path) -> Gaussians:

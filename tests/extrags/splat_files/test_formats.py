@@ -5,12 +5,15 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
+import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from scipy.spatial import cKDTree
 
 from extrags.cameras import Cameras
 from extrags.errors import CaptureError
@@ -19,6 +22,7 @@ from extrags.scene import Scene
 from extrags.splat_files import (
     bake_light,
     read_splat_file,
+    sog,
     write_compressed_ply,
     write_ply_scene,
     write_sog,
@@ -160,6 +164,51 @@ def test_what_spz_holds(baked: Gaussians, tmp_path: Path) -> None:
         assert (float(levels[0]), float(levels[-1])) == (-1, 127 / 128)
         # The last step is cut off by the bound.
         assert levels.diff()[:-1].unique().tolist() == [step]
+
+
+def _traced_share(write: Callable[[], None], gaussians: Gaussians) -> float:
+    """Most memory of arrays that writing takes, relative to that of the scene."""
+    write()
+    tracemalloc.start()
+    try:
+        write()
+        return tracemalloc.get_traced_memory()[1] / sum(v.nbytes for v in gaussians.parameters().values())
+    finally:
+        tracemalloc.stop()
+
+
+def test_memory_of_writing(lit: Scene, tmp_path: Path) -> None:
+    """Harmonics are most of a scene; in double precision they take several times as much as all of it."""
+    values = lit.gaussians.subset(torch.arange(400).repeat(50)).parameters()
+    values["shN"] = torch.cat([values["shN"], values["shN"][:, :7]], dim=1)
+    many = Gaussians(**values)
+    assert _traced_share(lambda: write_spz(many, tmp_path / "a.spz"), many) < 5
+    plain = _traced_share(lambda: write_ply_scene(Scene(many), tmp_path / "a.ply"), many)
+    kept = _traced_share(lambda: write_ply_scene(Scene(many, lit.light), tmp_path / "a.ply"), many)
+    assert kept < 1.05 * plain
+
+
+def test_a_palette_of_many_entries_is_not_compared_with_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nor is it much worse for that: here than with every vector's nearest entry."""
+    generator = torch.Generator().manual_seed(5)
+    mixing = torch.randn(6, 45, generator=generator)
+    vectors = torch.randn(6000, 6, generator=generator) @ mixing
+    vectors = (vectors + 0.3 * torch.randn(6000, 45, generator=generator)).numpy()
+    compared = 0
+    original = sog._nearest_of_all
+
+    def counted(rows: np.ndarray, centers: np.ndarray) -> np.ndarray:
+        nonlocal compared
+        compared += len(rows) * len(centers)
+        return original(rows, centers)
+
+    monkeypatch.setattr(sog, "_nearest_of_all", counted)
+    palette, labels = sog._palette(vectors)
+    assert len(palette) == 3000
+    assert compared < 0.5 * 5 * len(vectors) * len(palette)
+    error = np.sqrt(((vectors - palette[labels]) ** 2).mean())
+    least = np.sqrt((cKDTree(palette).query(vectors)[0] ** 2).mean() / 45)
+    assert error < 1.05 * least
 
 
 @pytest.mark.slow
