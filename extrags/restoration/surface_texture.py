@@ -12,6 +12,7 @@ projection from three sides is common in graphics.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -61,6 +62,8 @@ UNCONFIRMED_FROM, UNCONFIRMED_TO = 0.2, 0.6
 """Texture sets in where a pixel is this much to be invented, and is complete from the second number on."""
 MIP_LEVELS = 4
 TILES_AT_ONCE = 64
+MIN_SOLID = 0.99
+"""Share of a texel's area that must be on the surface."""
 
 
 @dataclass(frozen=True)
@@ -118,10 +121,7 @@ class SurfaceTexture:
         tiles = _cut_tiles(
             views, depth, places.subset(places.pixel_mm <= COARSEST_PIXEL * texel_mm), texel_mm
         )
-        if len(tiles) == 0:
-            return None
-        kept = np.unique(np.linspace(0, len(tiles) - 1, MOST_TILES).round().astype(np.int64))
-        return cls(tiles[kept].contiguous(), texel_mm, seed)
+        return None if len(tiles) == 0 else cls(tiles, texel_mm, seed)
 
     def applied(
         self,
@@ -307,7 +307,7 @@ class _Places:
     normals: Float[Tensor, "n 3"]
     pixel_mm: Float[Tensor, "n"]
 
-    def subset(self, index: Bool[Tensor, "n"]) -> _Places:
+    def subset(self, index: Bool[Tensor, "n"] | Int[Tensor, "m"]) -> _Places:
         return _Places(self.view[index], self.points[index], self.normals[index], self.pixel_mm[index])
 
 
@@ -344,59 +344,84 @@ def _places(
 def _cut_tiles(
     views: ReferenceViews, depth: Float[Tensor, "r 1 h w"], places: _Places, texel_mm: float
 ) -> Float[Tensor, "e 3 t t"]:
-    """Relative detail of the views around places, seen along the normal, where the wall is nearly plane."""
+    """Relative detail of the views around places, seen along the normal, where the wall is nearly plane.
+
+    Of more than `MOST_TILES` places that give a tile, so many evenly spaced ones.
+    """
+    maps = torch.cat([views.packed[:, :4], depth], dim=1)
+
+    def shown(chosen: _Places) -> Iterator[tuple[Tensor, Tensor]]:
+        for view in chosen.view.unique_consecutive().tolist():
+            for part in (chosen.view == view).nonzero()[:, 0].split(TILES_AT_ONCE):
+                yield _seen_on(_planes(chosen.subset(part), texel_mm), views, maps, view)
+
+    found = [torch.zeros(0, dtype=torch.bool), *(_is_whole(*place) for place in shown(places))]
+    whole = torch.cat(found).nonzero()[:, 0]
+    if not len(whole):
+        return torch.zeros(0, 3, TILE_TEXELS, TILE_TEXELS)
+    kept = np.unique(np.linspace(0, len(whole) - 1, MOST_TILES).round().astype(np.int64))
+    return torch.cat([_detail_of(*place) for place in shown(places.subset(whole[kept]))])
+
+
+def _planes(places: _Places, texel_mm: float) -> Float[Tensor, "n s s 3"]:
+    """Points of the planes that touch the surface in these places, twice as fine as texels."""
     helper = torch.eye(3)[places.normals.abs().argmin(-1)]
     across = functional.normalize(torch.linalg.cross(places.normals, helper), dim=-1)
     down = torch.linalg.cross(places.normals, across)
     side = TILE_TEXELS + 2 * MARGIN_TEXELS
-    # Twice as fine, then averaged: a texel is an area, not a point.
+    # They are averaged later: a texel is an area, not a point.
     steps = ((torch.arange(2 * side) + 0.5) / 2 - side / 2) * texel_mm
-    maps = torch.cat([views.packed[:, :4], depth], dim=1)
-    tiles = [torch.zeros(0, 3, TILE_TEXELS, TILE_TEXELS)]
-    for part in torch.arange(len(places.view)).split(TILES_AT_ONCE):
-        plane = (
-            places.points[part, None, None]
-            + steps[None, None, :, None] * across[part, None, None]
-            + steps[None, :, None, None] * down[part, None, None]
-        )
-        tiles.append(_detail_of(*_seen_on(plane, views, maps, places.view[part])))
-    return torch.cat(tiles)
+    points: Tensor = (
+        places.points[:, None, None]
+        + steps[None, None, :, None] * across[:, None, None]
+        + steps[None, :, None, None] * down[:, None, None]
+    )
+    return points
 
 
 def _seen_on(
     plane: Float[Tensor, "n s s 3"],
     views: ReferenceViews,
     maps: Float[Tensor, "r 5 h w"],
-    view: Int[Tensor, "n"],
+    view: int,
 ) -> tuple[Float[Tensor, "n 3 s2 s2"], Float[Tensor, "n 1 s2 s2"]]:
-    """Colours that views show at points of a plane, and where these are on the surface, at half the size."""
+    """Colours that a view shows at points of planes, and where these are on the surface, at half the size."""
     height, width = maps.shape[-2:]
     pose, K = views.viewmats[view], views.K[view]
-    local = torch.einsum("nij,nhwj->nhwi", pose[:, :3, :3], plane) + pose[:, None, None, :3, 3]
+    local = torch.einsum("ij,nhwj->nhwi", pose[:3, :3], plane) + pose[:3, 3]
     depth = local[..., 2].clamp_min(1e-6)
-    u = local[..., 0] / depth * K[:, 0, 0, None, None] + K[:, 0, 2, None, None]
-    v = local[..., 1] / depth * K[:, 1, 1, None, None] + K[:, 1, 2, None, None]
+    u = local[..., 0] / depth * K[0, 0] + K[0, 2]
+    v = local[..., 1] / depth * K[1, 1] + K[1, 2]
     grid = torch.stack([2 * u / width - 1, 2 * v / height - 1], dim=-1)
-    shown = functional.grid_sample(maps[view], grid, mode="bilinear", align_corners=False)
+    # Expanded, not indexed: that would copy the view for each of the planes.
+    image = maps[view].expand(len(plane), -1, -1, -1)
+    shown = functional.grid_sample(image, grid, mode="bilinear", align_corners=False)
     near = (shown[:, 4].clamp_min(1e-9) / depth).log().abs() < DEPTH_TOLERANCE
     solid = near & (shown[:, 3] > 0.5) & (local[..., 2] > 1e-6)
     return functional.avg_pool2d(shown[:, :3], 2), functional.avg_pool2d(solid[:, None].float(), 2)
 
 
-def _detail_of(rgb: Float[Tensor, "n 3 s s"], solid: Float[Tensor, "n 1 s s"]) -> Float[Tensor, "e 3 t t"]:
-    """Relative detail of the tiles that are whole and bright enough."""
-    solid = (solid > 0.99).float()
+def _is_whole(rgb: Float[Tensor, "n 3 s s"], solid: Float[Tensor, "n 1 s s"]) -> Bool[Tensor, "n"]:
+    """Which tiles are on the surface, and bright enough."""
+    bright = rgb.mean(dim=1, keepdim=True) > MIN_BRIGHTNESS
+    return torch.stack(
+        [_inner(part.float()).mean(dim=(1, 2, 3)) > 0.95 for part in (solid > MIN_SOLID, bright)]
+    ).all(0)
+
+
+def _detail_of(rgb: Float[Tensor, "n 3 s s"], solid: Float[Tensor, "n 1 s s"]) -> Float[Tensor, "n 3 t t"]:
+    """Relative detail of tiles."""
+    solid = (solid > MIN_SOLID).float()
     window = gaussian_weights(DETAIL_SIGMA, DETAIL_RADIUS)
     mass = filter_separable(solid, window, window).clamp_min(1e-3)
     low = filter_separable(rgb * solid, window, window) / mass
-    inner = slice(MARGIN_TEXELS, -MARGIN_TEXELS)
-    bright = (rgb.mean(dim=1, keepdim=True) > MIN_BRIGHTNESS).float()
-    whole = torch.stack([part[..., inner, inner].mean(dim=(1, 2, 3)) > 0.95 for part in (solid, bright)]).all(
-        0
-    )
-    detail = ((rgb - low) / (low + DARKNESS) * solid)[whole][..., inner, inner]
-    detail = detail.clamp(-MOST_DETAIL, MOST_DETAIL)
+    detail = _inner((rgb - low) / (low + DARKNESS) * solid).clamp(-MOST_DETAIL, MOST_DETAIL)
     return detail - detail.mean(dim=(2, 3), keepdim=True)
+
+
+def _inner(maps: Float[Tensor, "n c s s"]) -> Float[Tensor, "n c t t"]:
+    """Tiles without their margins."""
+    return maps[..., MARGIN_TEXELS:-MARGIN_TEXELS, MARGIN_TEXELS:-MARGIN_TEXELS]
 
 
 def _hashed(cell: Int[Tensor, "n 2"], axis: int, seed: int) -> Int[Tensor, "n"]:

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from extrags.cameras import Cameras, pixel_rays
+from extrags.restoration import surface_texture
 from extrags.restoration.surface_texture import DARKNESS, MOST_DETAIL, SurfaceTexture, _hashed
 from extrags.view_synthesis.references import LightTransfer, ReferenceViews
 
@@ -92,6 +93,37 @@ class TestTiles:
         references = plane_references(facing_plane((0, 0)))
         references.packed[:, :3] *= 0.05
         assert SurfaceTexture.of_references(references) is None
+
+    def test_no_more_are_cut_than_are_kept(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        references = plane_references(facing_plane((0, 0), (7, 3)))
+        every = SurfaceTexture.of_references(references)
+        assert every is not None
+        assert len(every.tiles) < surface_texture.MOST_TILES
+        cut = 0
+        original = surface_texture._detail_of
+
+        def counted(rgb: torch.Tensor, solid: torch.Tensor) -> torch.Tensor:
+            nonlocal cut
+            cut += len(rgb)
+            return original(rgb, solid)
+
+        monkeypatch.setattr(surface_texture, "_detail_of", counted)
+        monkeypatch.setattr(surface_texture, "MOST_TILES", 7)
+        few = SurfaceTexture.of_references(references)
+        assert few is not None
+        assert cut == len(few.tiles) == 7
+        chosen = np.linspace(0, len(every.tiles) - 1, 7).round().astype(np.int64)
+        assert torch.equal(few.tiles, every.tiles[chosen])
+
+    def test_views_are_not_copied_for_each_tile(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        sampled = surface_texture.functional.grid_sample
+
+        def shared(image: torch.Tensor, grid: torch.Tensor, **rest: object) -> torch.Tensor:
+            assert image.untyped_storage().nbytes() == 2 * 5 * WIDTH * HEIGHT * 4
+            return sampled(image, grid, **rest)
+
+        monkeypatch.setattr(surface_texture.functional, "grid_sample", shared)
+        assert SurfaceTexture.of_references(plane_references(facing_plane((0, 0), (7, 3)))) is not None
 
 
 class TestDetail:
