@@ -14,12 +14,17 @@ from jaxtyping import Float, UInt32
 
 from extrags.gaussians import SH_C0, Gaussians
 from extrags.output_files import whole_file
-from extrags.splat_files.packing import largest_component, morton_order, unit_quaternions
+from extrags.splat_files.packing import (
+    SCALE_LIMIT,
+    largest_component,
+    levels,
+    neighbours_together,
+    unit_quaternions,
+)
 
 __all__ = ["write_compressed_ply"]
 
 _CHUNK = 256
-_SCALE_LIMIT = 20.0
 
 
 def write_compressed_ply(gaussians: Gaussians, path: Path) -> None:
@@ -35,12 +40,11 @@ def write_compressed_ply(gaussians: Gaussians, path: Path) -> None:
     from plyfile import PlyData, PlyElement
 
     n = len(gaussians)
-    gaussians = gaussians.for_file(path)
-    order = morton_order(gaussians.means.numpy())
-    means = gaussians.means.numpy()[order].astype(np.float64)
-    scales = gaussians.scales.numpy()[order].astype(np.float64).clip(-_SCALE_LIMIT, _SCALE_LIMIT)
-    colors = 0.5 + SH_C0 * gaussians.sh0.numpy()[order, 0].astype(np.float64)
-    opacity = gaussians.opacities.sigmoid().numpy()[order].astype(np.float64)
+    gaussians = neighbours_together(gaussians.for_file(path))
+    means = gaussians.means.double().numpy()
+    scales = gaussians.scales.double().numpy().clip(-SCALE_LIMIT, SCALE_LIMIT)
+    colors = 0.5 + SH_C0 * gaussians.sh0[:, 0].double().numpy()
+    opacity = gaussians.opacities.sigmoid().double().numpy()
     columns: dict[str, np.ndarray] = {}
     shares = {}
     for values, axes, short in (
@@ -67,12 +71,12 @@ def write_compressed_ply(gaussians: Gaussians, path: Path) -> None:
     vertex["packed_position"] = _packed(shares["position"], (11, 10, 11))
     vertex["packed_scale"] = _packed(shares["scale"], (11, 10, 11))
     vertex["packed_color"] = _packed(np.column_stack([shares["color"], opacity]), (8, 8, 8, 8))
-    largest, rest = largest_component(unit_quaternions(gaussians.quats.numpy()[order]))
+    largest, rest = largest_component(unit_quaternions(gaussians.quats.numpy()))
     rotation = _packed(rest * np.sqrt(0.5) + 0.5, (10, 10, 10))
     vertex["packed_rotation"] = rotation | largest.astype(np.uint32) << 30
     elements = [PlyElement.describe(chunk, "chunk"), PlyElement.describe(vertex, "vertex")]
     if gaussians.shN.shape[1]:
-        rest_n = gaussians.shN.numpy()[order].transpose(0, 2, 1).reshape(n, -1)
+        rest_n = gaussians.shN.numpy().transpose(0, 2, 1).reshape(n, -1)
         sh = np.empty(n, dtype=[(f"f_rest_{k}", "u1") for k in range(rest_n.shape[1])])
         for k in range(rest_n.shape[1]):
             sh[f"f_rest_{k}"] = np.floor((rest_n[:, k] / 8 + 0.5) * 256).clip(0, 255)
@@ -103,8 +107,5 @@ def _packed(shares: Float[np.ndarray, "n k"], bits: tuple[int, ...]) -> UInt32[n
     """Numbers in [0, 1] side by side in one word, the first in its highest bits."""
     word = np.zeros(len(shares), dtype=np.uint32)
     for column, width in enumerate(bits):
-        largest = (1 << width) - 1
-        word = word << np.uint32(width) | np.rint(shares[:, column] * largest).clip(0, largest).astype(
-            np.uint32
-        )
+        word = word << np.uint32(width) | levels(shares[:, column], width)
     return word

@@ -1,13 +1,31 @@
-"""How the compressed formats pack rotations, and in which order they store Gaussians."""
+"""How the compressed formats pack numbers and rotations, and in which order they store Gaussians."""
 
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float, Int
+import torch
+from jaxtyping import Float, Int, UInt32
 
-__all__ = ["largest_component", "morton_order", "unit_quaternions"]
+from extrags.gaussians import Gaussians
 
+__all__ = [
+    "SCALE_LIMIT",
+    "largest_component",
+    "levels",
+    "morton_order",
+    "neighbours_together",
+    "unit_quaternions",
+]
+
+SCALE_LIMIT = 20.0
+"""Of logarithms of scales: one stray must not take the range that all of its chunk or codebook share."""
 _MORTON_BITS = 20
+
+
+def levels(shares: Float[np.ndarray, "*shape"], bits: int) -> UInt32[np.ndarray, "*shape"]:
+    """Numbers in [0, 1] as whole numbers of so many bits; for others the nearer end."""
+    largest = (1 << bits) - 1
+    return np.asarray(np.rint(shares * largest).clip(0, largest).astype(np.uint32))
 
 
 def unit_quaternions(quats: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
@@ -48,3 +66,8 @@ def morton_order(means: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n"]:
         for axis in range(3):
             code |= ((cell[:, axis] >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)
     return np.argsort(code, kind="stable")
+
+
+def neighbours_together(gaussians: Gaussians) -> Gaussians:
+    """The same Gaussians in Morton order; on the processor."""
+    return gaussians.subset(torch.from_numpy(morton_order(gaussians.means.numpy())))

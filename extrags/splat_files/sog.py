@@ -19,7 +19,13 @@ from jaxtyping import Float, Int, Shaped, UInt8
 
 from extrags.gaussians import Gaussians
 from extrags.output_files import whole_file
-from extrags.splat_files.packing import largest_component, morton_order, unit_quaternions
+from extrags.splat_files.packing import (
+    SCALE_LIMIT,
+    largest_component,
+    levels,
+    neighbours_together,
+    unit_quaternions,
+)
 
 __all__ = ["write_sog"]
 
@@ -32,7 +38,6 @@ _SAMPLE_PER_ENTRY = 4
 _CELLS_SEARCHED = 16
 _COMPARED_AT_ONCE = 1 << 18
 """Numbers that stay in a processor's cache."""
-_SCALE_LIMIT = 20.0
 _TIME = (1980, 1, 1, 0, 0, 0)
 """The earliest a zip knows: the same scene gives the same file."""
 
@@ -47,40 +52,37 @@ def write_sog(gaussians: Gaussians, path: Path) -> None:
     Raises:
         CaptureError: when there are no Gaussians.
     """
-    gaussians = gaussians.for_file(path)
-    order = morton_order(gaussians.means.numpy())
+    gaussians, n = neighbours_together(gaussians.for_file(path)), len(gaussians)
     images: dict[str, UInt8[np.ndarray, "h w 4"]] = {}
-    width = -(-int(np.ceil(np.sqrt(len(order)))) // 4) * 4
-    height = -(-len(order) // (width * 4)) * 4
+    width = -(-int(np.ceil(np.sqrt(n))) // 4) * 4
+    height = -(-n // (width * 4)) * 4
 
     def image(*channels: Shaped[np.ndarray, "n"]) -> UInt8[np.ndarray, "h w 4"]:
         """Three or four channels, one Gaussian per pixel; without a fourth it is opaque."""
         pixels = np.full((height * width, 4), 255, dtype=np.uint8)
         for index, channel in enumerate(channels):
-            pixels[: len(order), index] = channel
-        pixels[len(order) :, :3] = 0
+            pixels[:n, index] = channel
+        pixels[n:, :3] = 0
         return pixels.reshape(height, width, 4)
 
-    means = gaussians.means.numpy()[order].astype(np.float64)
+    means = gaussians.means.double().numpy()
     logs = np.sign(means) * np.log1p(np.abs(means))
     low, high = logs.min(axis=0), logs.max(axis=0)
-    fixed = np.rint((logs - low) / np.where(high > low, high - low, 1.0) * 65535).astype(np.uint16)
+    fixed = levels((logs - low) / np.where(high > low, high - low, 1.0), 16)
     images["means_l.webp"] = image(*(fixed & 255).T)
     images["means_u.webp"] = image(*(fixed >> 8).T)
-    largest, rest = largest_component(unit_quaternions(gaussians.quats.numpy()[order]))
-    images["quats.webp"] = image(
-        *np.rint((rest * np.sqrt(2) * 0.5 + 0.5) * 255).clip(0, 255).T, 252 + largest
-    )
-    scales = gaussians.scales.numpy()[order].clip(-_SCALE_LIMIT, _SCALE_LIMIT)
+    largest, rest = largest_component(unit_quaternions(gaussians.quats.numpy()))
+    images["quats.webp"] = image(*levels(rest * np.sqrt(2) * 0.5 + 0.5, 8).T, 252 + largest)
+    scales = gaussians.scales.numpy().clip(-SCALE_LIMIT, SCALE_LIMIT)
     scale_labels, scale_codebook = _codebook(scales)
     images["scales.webp"] = image(*scale_labels.T)
-    color_labels, color_codebook = _codebook(gaussians.sh0.numpy()[order, 0])
-    opacity = np.rint(gaussians.opacities.sigmoid().numpy()[order] * 255)
+    color_labels, color_codebook = _codebook(gaussians.sh0[:, 0].numpy())
+    opacity = levels(gaussians.opacities.sigmoid().numpy(), 8)
     images["sh0.webp"] = image(*color_labels.T, opacity)
     meta: dict[str, Any] = {
         "version": 2,
         "asset": {"generator": "extrags"},
-        "count": len(order),
+        "count": n,
         "means": {
             "mins": low.tolist(),
             "maxs": high.tolist(),
@@ -91,8 +93,8 @@ def write_sog(gaussians: Gaussians, path: Path) -> None:
         "sh0": {"codebook": color_codebook.tolist(), "files": ["sh0.webp"]},
     }
     if gaussians.sh_degree:
-        shN = gaussians.shN.numpy()[order]
-        palette, labels = _palette(shN.reshape(len(order), -1))
+        shN = gaussians.shN.numpy()
+        palette, labels = _palette(shN.reshape(n, -1))
         entries, codebook = _codebook(palette)
         rows = -(-len(palette) // _PALETTE_ROW)
         centroids = np.full((rows * _PALETTE_ROW, shN.shape[1], 4), 255, dtype=np.uint8)

@@ -25,7 +25,7 @@ from jaxtyping import Float, UInt8
 from extrags.errors import SourceError, SourceNotFoundError
 from extrags.gaussians import Gaussians
 from extrags.output_files import write_file
-from extrags.splat_files.packing import largest_component, unit_quaternions
+from extrags.splat_files.packing import largest_component, levels, unit_quaternions
 from extrags.splat_files.spz_streams import read_header, read_planes
 
 __all__ = ["read_spz", "write_spz"]
@@ -67,9 +67,9 @@ def write_spz(gaussians: Gaussians, path: Path) -> None:
         raise SourceError(f"positions reach to {reach:g}; SPZ holds at most 2^23 units", field="means")
     fixed = np.rint(means * (1 << bits)).astype("<i4")
     positions = fixed.view(np.uint8).reshape(n, 3, 4)[:, :, :3]
-    opacities = _bytes(gaussians.opacities.sigmoid().numpy() * 255)
+    opacities = levels(gaussians.opacities.sigmoid().numpy(), 8).astype(np.uint8)
     sh0 = gaussians.sh0.numpy()[:, 0]
-    colors = _bytes((sh0 * _COLOR_SCALE + 0.5) * 255)
+    colors = levels(sh0 * _COLOR_SCALE + 0.5, 8).astype(np.uint8)
     scales = _bytes((gaussians.scales.numpy() + 10) * 16)
     # Components in the format's order x, y, z, w.
     quats = unit_quaternions(gaussians.quats.numpy())[:, [1, 2, 3, 0]] * [1, -1, -1, 1]
