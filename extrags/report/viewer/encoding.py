@@ -24,6 +24,7 @@ from jaxtyping import Float, Int, UInt8
 from extrags.errors import ShapeError, SourceError
 from extrags.gaussians import Gaussians
 from extrags.raster.rendering import ALPHA_MIN
+from extrags.splat_files.packing import largest_component, levels, unit_quaternions
 
 __all__ = ["EncodedScene", "Quantity", "decoded_scene", "encoded_scene", "faint_gaussians"]
 
@@ -189,12 +190,8 @@ def _channel_planes(kind: str, values: Float[np.ndarray, "n c"]) -> list[bytes]:
 
 def _rotation_planes(quats: Float[np.ndarray, "n 4"]) -> list[bytes]:
     """Three components of ten bits each, and in the upper two bits which one is left out."""
-    unit = quats / np.linalg.norm(quats, axis=1, keepdims=True)
-    largest = np.abs(unit).argmax(1)
-    rows = np.arange(len(unit))
-    unit = unit * np.where(unit[rows, largest] < 0, -1.0, 1.0)[:, None]
-    rest = unit[np.arange(4) != largest[:, None]].reshape(-1, 3)
-    level = np.rint((rest / SQRT_HALF * 0.5 + 0.5).clip(0, 1) * 1023).astype(np.uint32)
+    largest, rest = largest_component(unit_quaternions(quats))
+    level = levels(rest / SQRT_HALF * 0.5 + 0.5, 10)
     word = level[:, 0] | level[:, 1] << 10 | level[:, 2] << 20 | largest.astype(np.uint32) << 30
     packed = np.ascontiguousarray(word.astype("<u4").view(np.uint8).reshape(-1, 4).T)
     return [packed.tobytes()]

@@ -74,6 +74,12 @@ def test_what_no_picture_shows_is_left_out(scene: Scene) -> None:
     assert encoded_scene(replace(scene.gaussians, opacities=opacities)).count == len(opacities) - 10
 
 
+def test_a_rotation_of_length_zero_is_none(scene: Scene) -> None:
+    one = scene.gaussians.subset(torch.arange(1))
+    found, _ = decoded_scene(encoded_scene(replace(one, quats=torch.zeros(1, 4))))
+    assert found.quats[0].tolist() == pytest.approx([1, 0, 0, 0], abs=1e-3)
+
+
 @pytest.mark.parametrize("count", [0, 1, 256, 257])
 def test_few_gaussians(scene: Scene, count: int) -> None:
     few = scene.gaussians.subset(torch.arange(count))
