@@ -29,12 +29,14 @@ def write_points(gaussians: Gaussians, path: Path, *, min_opacity: float = 0.5) 
 
     Raises:
         CaptureError: when none is opaque enough.
+        NonFiniteError: when a parameter of one that is written is NaN or infinite.
     """
     from plyfile import PlyData, PlyElement
 
-    kept = gaussians.subset(gaussians.opacities.sigmoid() >= min_opacity).detached().to("cpu")
+    kept = gaussians.subset(gaussians.opacities.sigmoid() >= min_opacity)
     if not len(kept):
         raise CaptureError(f"no Gaussian has an opacity of {min_opacity:g} or more; there are no points")
+    kept = kept.for_file(path)
     rows = np.empty(
         len(kept),
         dtype=[(name, "f4") for name in ("x", "y", "z", "nx", "ny", "nz")]

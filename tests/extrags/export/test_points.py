@@ -10,7 +10,7 @@ import pytest
 import torch
 import trimesh
 
-from extrags.errors import CaptureError
+from extrags.errors import CaptureError, NonFiniteError
 from extrags.export import write_points
 from extrags.gaussians import SH_C0
 from extrags.splat_files import bake_light
@@ -47,3 +47,11 @@ def test_gaussians_elsewhere(tube: Tube, elsewhere: torch.device, tmp_path: Path
     write_points(baked, tmp_path / "a.ply")
     write_points(baked.to(elsewhere), tmp_path / "b.ply")
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+
+
+def test_what_is_no_number_is_refused(tube: Tube, tmp_path: Path) -> None:
+    gaussians = bake_light(tube.scene)
+    gaussians.means[:3] = torch.nan
+    with pytest.raises(NonFiniteError, match=f"means of 3 of {len(gaussians)} Gaussians hold NaN"):
+        write_points(gaussians, tmp_path / "a.ply")
+    assert not (tmp_path / "a.ply").exists()
