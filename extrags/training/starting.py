@@ -21,7 +21,7 @@ from extrags.known_depth import FARTHEST, is_background
 from extrags.sequence import EndoscopicSequence
 from extrags.sparse_depth import MIN_POINTS_PER_VIEW, interpolated_depth, pixel_lattice
 from extrags.training.random_start import depth_range, random_depth
-from extrags.training.surest_depth import surest_points
+from extrags.training.surest_depth import agreed_depth, surest_points
 
 __all__ = [
     "LEAST_COLOR",
@@ -114,8 +114,8 @@ def starting_gaussians(
 
     Unsure pixels of estimated depth beside sure ones start none: where depth jumps, an estimate lies between
     both surfaces, and Gaussians there would hang in front of what was never seen. Nor do estimates of what
-    another frame knows much better (`extrags.training.surest_depth`), or backgrounds (`extrags.known_depth`),
-    which a warning counts.
+    another frame knows much better; the others start where all frames together have the surface
+    (`extrags.training.surest_depth`). Nor do backgrounds (`extrags.known_depth`), which a warning counts.
 
     Each point carries the mean albedo of its pixels: the colour with light and response divided out.
     Radii follow the distance to the three nearest neighbours. Random points lie in the cameras' frusta; they
@@ -143,7 +143,9 @@ def starting_gaussians(
     if sequence.depth_error is not None and _depth_known(sequence, frames):
         error = _of_frames(sequence.depth_error, frames).reshape(-1)[chosen] * z
         surest = surest_points(points, error, sequence, frames)
-        chosen, z, points, rays, view = (part[surest] for part in (chosen, z, points, rays, view))
+        chosen, z, rays, view, error = (part[surest] for part in (chosen, z, rays, view, error))
+        z = agreed_depth(cameras.centers[view], rays, z, error, sequence, frames, depth)
+        points, rays, view = _back_projected(cameras, chosen, z)
     rgb = _of_frames(sequence.rgb, frames).reshape(-1, 3)[chosen].astype(np.float64) / 255
     if light is not None:
         local = np.einsum("nji,nj->ni", cameras.world_from_camera[view, :3, :3], z[:, None] * rays)

@@ -7,9 +7,9 @@ import pytest
 from scipy.spatial import cKDTree
 
 from extrags.cameras import rays_of_pixels
-from extrags.sequence import EndoscopicSequence
+from extrags.sequence import EndoscopicSequence, Split
 from extrags.training.starting import starting_gaussians
-from extrags.training.surest_depth import SURER_FACTOR, surest_points
+from extrags.training.surest_depth import SURER_FACTOR, agreed_depth, surest_points
 
 
 def estimated(sequence: EndoscopicSequence, error_mm: float = 0.2) -> EndoscopicSequence:
@@ -29,6 +29,39 @@ def points_of(sequence: EndoscopicSequence, frame: int) -> tuple[np.ndarray, np.
     z = sequence.depth_mm[frame].reshape(-1)[chosen].astype(np.float64)
     points = camera.centers + z[:, None] * rays_of_pixels(camera, chosen)
     return points, sequence.depth_error[frame].reshape(-1)[chosen] * z
+
+
+def agreed(sequence: EndoscopicSequence, frame: int, frames: list[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Depth of a frame as those frames have it, and its own."""
+    assert sequence.depth_mm is not None
+    points, error = points_of(sequence, frame)
+    camera = sequence.cameras[np.array([frame])]
+    chosen = np.flatnonzero(sequence.depth_mm[frame] > 0)
+    z = sequence.depth_mm[frame].reshape(-1)[chosen].astype(np.float64)
+    centers = np.broadcast_to(camera.centers, points.shape)
+    rays = rays_of_pixels(camera, chosen)
+    depth = sequence.depth_mm[frames]
+    return agreed_depth(centers, rays, z, error, sequence, np.array(frames), depth), z
+
+
+def before_a_slanted_wall() -> EndoscopicSequence:
+    """Five cameras that look at the plane z = 10 + x / 2 from different places, and its exact depth."""
+    K = np.array([[40.0, 0, 32], [0, 40.0, 24], [0, 0, 1]])
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    poses[:, :3, 3] = [(0, 0, 0), (1, 0, 0), (-1, 0.5, 1), (0, -1, 2), (0.5, 1, -1)]
+    x = np.broadcast_to((np.arange(64) + 0.5 - 32) / 40, (48, 64))
+    start = poses[:, :3, 3]
+    depth = (10 + start[:, 0] / 2 - start[:, 2])[:, None, None] / (1 - x / 2)
+    return EndoscopicSequence(
+        "test/wall",
+        np.zeros((5, 48, 64, 3), np.uint8),
+        np.tile(K, (5, 1, 1)),
+        np.ones((5, 48, 64), bool),
+        Split("test", np.arange(4), np.array([4])),
+        world_from_camera=poses,
+        depth_mm=depth.astype(np.float32),
+        depth_error=np.full((5, 48, 64), 0.02, np.float32),
+    )
 
 
 def kept(sequence: EndoscopicSequence, frame: int, others: list[int]) -> np.ndarray:
@@ -99,6 +132,46 @@ class TestSurestPoints:
         before = kept(sequence, first, [second])
         sequence.depth_error[third] *= 0.1
         np.testing.assert_array_equal(kept(sequence, first, [second]), before)
+
+
+class TestAgreedDepth:
+    def test_frames_before_a_slanted_wall_agree_on_it(self) -> None:
+        """Each is off by its own constant share of depth; along a ray, the planes say where the wall is."""
+        sequence, off = before_a_slanted_wall(), np.array([0.02, -0.01, 0.01, -0.02, 0.015])
+        assert sequence.depth_mm is not None
+        truth = sequence.depth_mm[0].reshape(-1).astype(np.float64)
+        exact, z = agreed(sequence, 0, list(range(5)))
+        np.testing.assert_allclose(exact, z, rtol=1e-5)
+        sequence.depth_mm[:] *= (1 + off)[:, None, None].astype(np.float32)
+        found, z = agreed(sequence, 0, list(range(5)))
+        np.testing.assert_allclose(z / truth - 1, 0.02, atol=1e-6)
+        # What all five see is off by their mean, 0.3 %, up to how differently near they stand.
+        assert np.median(np.abs(found / truth - 1)) < 0.008
+
+    def test_frames_weigh_by_their_expected_errors(self, tube_sequence: EndoscopicSequence) -> None:
+        """Two frames of one pose: the mean by inverse squares of 0 and 0.3 mm, 1 to 9."""
+        sequence = estimated(tube_sequence, 0.3)
+        assert sequence.depth_mm is not None
+        assert sequence.depth_error is not None
+        assert sequence.world_from_camera is not None
+        first, second = sequence.train[:2].tolist()
+        poses = sequence.world_from_camera.copy()
+        poses[second] = poses[first]
+        sequence = replace(sequence, world_from_camera=poses)
+        before, _ = agreed(sequence, first, [first])
+        sequence.depth_mm[second] = sequence.depth_mm[first] + 0.3
+        sequence.depth_error[second] = sequence.depth_error[first] / 3
+        found, _ = agreed(sequence, first, [first, second])
+        assert np.median(found - before) == pytest.approx(0.27, abs=0.02)
+
+    def test_another_surface_has_no_say(self, tube_sequence: EndoscopicSequence) -> None:
+        sequence = estimated(tube_sequence, 0.1)
+        assert sequence.depth_mm is not None
+        first, second = sequence.train[:2].tolist()
+        before, _ = agreed(sequence, first, [first])
+        sequence.depth_mm[second] *= 2
+        found, _ = agreed(sequence, first, [first, second])
+        assert np.mean(found == before) > 0.98
 
 
 class TestStarts:
