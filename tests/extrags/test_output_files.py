@@ -14,13 +14,14 @@ from extrags.array_files import save_safetensors
 from extrags.cameras import Cameras
 from extrags.export import CameraPath, ColoredMesh, write_camera_path, write_mesh, write_points, write_video
 from extrags.gaussians import Gaussians
+from extrags.illumination import NearFieldLight
 from extrags.output_files import remove_unfinished, whole_file, whole_folder, write_file
 from extrags.report.calibration_plot import write_calibration_plot
 from extrags.restoration.uncertainty.reliability_diagram import calibration
 from extrags.scene import Scene
 from extrags.splat_files import write_compressed_ply, write_ply_scene, write_sog, write_spz
 from extrags.surface import Mesh
-from tests.extrags.lit_tube import Tube, tube_cameras
+from tests.extrags.lit_tube import tube_cameras
 
 MESH = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], dtype=np.int32))
 COLORED = ColoredMesh(
@@ -58,6 +59,7 @@ def camera_path() -> CameraPath:
 WRITERS: dict[str, Callable[[Path], object]] = {
     "plain.ply": lambda path: few().write_ply(path),
     "scene.ply": lambda path: write_ply_scene(Scene(few()), path),
+    "lit.ply": lambda path: write_ply_scene(Scene(few(), NearFieldLight.initial(1, 20.0)), path),
     "compressed.ply": lambda path: write_compressed_ply(few(), path),
     "scene.spz": lambda path: write_spz(few(), path),
     "scene.sog": lambda path: write_sog(few(), path),
@@ -95,21 +97,6 @@ def test_what_is_interrupted_leaves_the_older_file_alone(
     WRITERS[name](file)
     assert file.read_bytes() != b"older"
     assert not list(tmp_path.glob(".*"))
-
-
-def test_the_light_of_a_scene_is_interrupted_as_well(
-    tube: Tube, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Its file is written twice, albedo first."""
-    file = tmp_path / "scene.ply"
-    file.write_text("older")
-    lit = Scene(few(), tube.scene.light)
-    with monkeypatch.context() as changed:
-        changed.setattr(Path, "read_bytes", lambda _: 1 / 0)
-        with pytest.raises(ZeroDivisionError):
-            write_ply_scene(lit, file)
-    assert file.read_text() == "older"
-    assert os.listdir(tmp_path) == ["scene.ply"]
 
 
 def test_a_video_whose_frames_end_in_the_middle_is_none(tmp_path: Path) -> None:

@@ -51,6 +51,7 @@ def all_but_one_held_out(sequence: EndoscopicSequence, config: object) -> PoseEs
     registered = np.arange(len(sequence)) != sequence.test[0]
     found = np.where(registered[:, None, None], sequence.world_from_camera, np.nan)
     counts = {"registered_train": 1, "n_train": 1, "registered_test": 1, "n_test": 1}
+    counts["triangulation_angle_deg"] = 10
     no_points = np.zeros((0, 3), np.float32)
     return PoseEstimate(
         "colmap", found, registered, no_points, no_points.astype(np.uint8), None, True, counts
