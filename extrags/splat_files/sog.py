@@ -154,7 +154,7 @@ def _palette(
 
 
 def _nearest(vectors: Float[np.ndarray, "n k"], centers: Float[np.ndarray, "p k"]) -> Int[np.ndarray, "n"]:
-    """Which centre is nearest to each vector, as good as always.
+    """Which centre is nearest to each vector, or nearly so where the nearest lies in a cell farther off.
 
     Harmonics of degree 3 have 45 dimensions, in which trees search nearly everything. So centres and vectors
     are sorted into cells, and a vector is compared with the centres of the cells next to its own.

@@ -139,13 +139,15 @@ def starting_gaussians(
     at_random = starts_at_random(sequence, frames)
     depth = _random_depth(sequence, cameras, seed) if at_random else _starting_depth(sequence, frames)
     chosen, z = _starting_pixels(sequence, frames, depth, where, max_points, seed)
-    points, rays, view = _back_projected(cameras, chosen, z)
+    rays = rays_of_pixels(cameras, chosen)
+    view = chosen // (sequence.width * sequence.height)
+    points = cameras.centers[view] + z[:, None] * rays
     if sequence.depth_error is not None and _depth_known(sequence, frames):
         error = _of_frames(sequence.depth_error, frames).reshape(-1)[chosen] * z
         surest = surest_points(points, error, sequence, frames)
         chosen, z, rays, view, error = (part[surest] for part in (chosen, z, rays, view, error))
         z = agreed_depth(cameras.centers[view], rays, z, error, sequence, frames, depth)
-        points, rays, view = _back_projected(cameras, chosen, z)
+        points = cameras.centers[view] + z[:, None] * rays
     rgb = _of_frames(sequence.rgb, frames).reshape(-1, 3)[chosen].astype(np.float64) / 255
     if light is not None:
         local = np.einsum("nji,nj->ni", cameras.world_from_camera[view, :3, :3], z[:, None] * rays)
@@ -212,15 +214,6 @@ def _starting_pixels(
         )
         chosen, z = chosen[~background], z[~background]
     return chosen, z
-
-
-def _back_projected(
-    cameras: Cameras, chosen: Int[np.ndarray, "n"], z: Float[np.ndarray, "n"]
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], Int[np.ndarray, "n"]]:
-    """Points at flat positions of pixels, the rays to them in world axes, and whose pixels they are."""
-    rays = rays_of_pixels(cameras, chosen)
-    view = chosen // (cameras.width * cameras.height)
-    return cameras.centers[view] + z[:, None] * rays, rays, view
 
 
 def _spacing(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:

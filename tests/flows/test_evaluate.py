@@ -50,8 +50,8 @@ def all_but_one_held_out(sequence: EndoscopicSequence, config: object) -> PoseEs
     assert sequence.world_from_camera is not None
     registered = np.arange(len(sequence)) != sequence.test[0]
     found = np.where(registered[:, None, None], sequence.world_from_camera, np.nan)
-    counts = {"registered_train": 1, "n_train": 1, "registered_test": 1, "n_test": 1}
-    counts["triangulation_angle_deg"] = 10
+    names = ("registered_train", "n_train", "registered_test", "n_test")
+    counts = {**dict.fromkeys(names, 1), "triangulation_angle_deg": 10}
     no_points = np.zeros((0, 3), np.float32)
     return PoseEstimate(
         "colmap", found, registered, no_points, no_points.astype(np.uint8), None, True, counts
