@@ -60,6 +60,8 @@ GROWN_FROM_START = 1.5
 eight reached their limit, which was that; the others ended at 1.24 to 1.44."""
 FINAL_WANTED = 5.0
 """The same after fine-tuning, as a multiple: 3.4 and 7.4 in the two scenes whose limit was far away."""
+FEATURES_PER_PX = 0.04
+"""About so many are found in small frames, where `poses.n_features` does not bound them."""
 REWEIGHTED = 20
 """Rounds of reweighting; the fit has settled by then."""
 PRIOR_RECORDS = 2.0
@@ -73,6 +75,10 @@ WORKLOAD_SETTINGS = (
     "coarse.pixels_per_point",
     "coarse.densify.enabled",
     "coarse.densify.max_gaussians",
+    "depth.hypotheses",
+    "depth.max_width",
+    "depth.monocular",
+    "depth.sources",
     "explore.score",
     "explore.starts",
     "explore.trajectories",
@@ -96,6 +102,11 @@ WORKLOAD_SETTINGS = (
     "finetune.judge.views",
     "evaluate.lpips_nets",
     "evaluate.restored",
+    "poses.exhaustive_below",
+    "poses.fallback",
+    "poses.max_width",
+    "poses.n_features",
+    "poses.sequential_overlap",
 )
 """All settings that predicted costs depend on: those that `Workload` reads, and those that say which tasks
 run and whether the coefficients hold of them. Without one of these, predictions are of other settings."""
@@ -174,6 +185,14 @@ class Workload:
             "more_evaluations": steps * samples - 1,
             # Of a network over a view: the frame once, each render as it is and aligned.
             "passes": 1.0 + 2.0 * self.stacks,
+            # Of an image as depth is estimated from it.
+            "matched_pixels": self._pixels_within(config.depth.max_width),
+            # In thousands, of all frames that one is matched with.
+            "hypotheses": min(config.depth.sources, self.train - 1) * config.depth.hypotheses / 1000,
+            # Of an image as features are looked for in it, in thousands of features.
+            "feature_pixels": self._pixels_within(config.poses.max_width),
+            "features": self._features() / 1000,
+            "pairs": self._matched_pairs(),
         }
 
     def _gaussians(self) -> tuple[float, float]:
@@ -203,6 +222,26 @@ class Workload:
         if self.width is None:
             return 1.0
         return (self.config.enhance.working_width(round(self.width)) / self.width) ** 2
+
+    def _pixels_within(self, max_width: int) -> float:
+        """Of an image that is no wider than that."""
+        share = 1.0 if self.width is None else min(1.0, max_width / self.width)
+        return float(self.pixels) * share**2
+
+    def _features(self) -> float:
+        """Of a frame."""
+        poses = self.config.poses
+        return min(float(poses.n_features), FEATURES_PER_PX * self._pixels_within(poses.max_width))
+
+    def _matched_pairs(self) -> float:
+        """Pairs of frames that COLMAP matches; see `extrags.poses.pairs`."""
+        poses, train = self.config.poses, float(self.train)
+        near, spread = poses.sequential_overlap, poses.exhaustive_below
+        if train <= spread:
+            return train * (train - 1) / 2 + self.test * train
+        # Neighbours, frames a power of two apart, and evenly spread ones.
+        farther = max(0.0, math.log2(train) - math.log2(near))
+        return train * (near + farther) + spread * (spread - 1) / 2 + self.test * (2 * near + spread)
 
     def term(self, name: str) -> float:
         """A product of numbers, e.g. `iterations*pixels`."""
@@ -325,6 +364,10 @@ def beyond_the_fit(task: str, config: PipelineConfig) -> tuple[str, ...]:
     # A restorer that was trained may have been found to be best with more steps.
     elif task == "enhance-train" or (restores and enhance.steps == "auto"):
         found += [f"enhance.train_iterations={enhance.train_iterations}"] * (enhance.train_iterations > 0)
+    if task == "poses" and config.poses.fallback == "rgbd":
+        found.append("poses.fallback=rgbd")
+    if task == "depth" and config.depth.monocular is not None:
+        found.append(f"depth.monocular={config.depth.monocular}")
     if task in ("finetune", "finetune-judge") and config.finetune.keep_scene:
         found.append("finetune.keep_scene=true")
     return tuple(found)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, replace
 from itertools import takewhile
 
@@ -15,16 +14,6 @@ from tasks.progress import StageProgress, duration_text
 
 __all__ = ["RunEstimate", "SequenceEstimate", "expected_seconds", "usual_pace", "without_kernels_in_words"]
 
-FEATURE_SECONDS_PER_PX = 3.9e-6
-MAPPING_SECONDS = 0.1
-"""Of a frame."""
-PAIR_SECONDS = (0.015, 0.105)
-"""Of a pair of frames: matched by few features, and what `poses.n_features` in both add. With the two above
-from four recordings (48 frames of 160 x 128 px: 20 s, 40 of 675 x 540: about 170, 35 of 1048 x 972: 208, and
-features of 1920 x 1080: 8 s a frame), which they give within a quarter."""
-USUAL_FEATURES = 6000
-FEATURES_PER_PX = 0.04
-"""About so many are found in small frames."""
 MEASURED_SCENES = 2
 """The coarse and the final scene."""
 
@@ -53,9 +42,6 @@ def expected_seconds(
         work: size of the sequence; None takes that of a phantom.
     """
     model, work = packaged_model(), usual_work(config) if work is None else work
-    usual = usual_work(config)
-    # Depth grows with the pixels of all frames, as far as it looks at them.
-    larger = {"depth": _pixels_of_depth(work) * work.train / (_pixels_of_depth(usual) * usual.train)}
     found: dict[StageName, dict[str, float]] = {}
     restored = int(config.evaluate.restored != "none")
     work = replace(work, stacks=MEASURED_SCENES + restored)
@@ -67,12 +53,8 @@ def expected_seconds(
             if task not in run:
                 continue
             cost = cost_of(task)
-            if task == "poses":
-                seconds = _seconds_of_poses(work)
-            elif task in model.time and not cost.unfitted:
-                seconds = times * model.predict(task, work).seconds
-            else:
-                seconds = (cost.usual_s or 0.0) * larger.get(task, 1.0)
+            known = task in model.time
+            seconds = times * model.predict(task, work).seconds if known else cost.usual_s or 0.0
             for part, share in (cost.shares or {task: 1.0}).items():
                 tasks[part] = share * seconds
         found[stage] = tasks
@@ -92,29 +74,6 @@ def without_kernels_in_words() -> str:
     if available_backends()[0] != "reference":
         return ""
     return ", with the compiled kernels; these are missing here, and what renders takes many times as long"
-
-
-def _seconds_of_poses(work: Workload) -> float:
-    """Features, matches of all pairs, and the map."""
-    settings, train = work.config.poses, work.train
-    near, spread = settings.sequential_overlap, settings.exhaustive_below
-    if train <= spread:
-        pairs = train * (train - 1) / 2 + work.test * train
-    else:
-        # See `extrags.poses.pairs`: neighbours, frames a power of two apart, and evenly spread ones.
-        farther = max(0.0, math.log2(train) - math.log2(near))
-        pairs = train * (near + farther) + spread * (spread - 1) / 2 + work.test * (2 * near + spread)
-    narrower = 1.0 if work.width is None else min(1.0, settings.max_width / float(work.width))
-    pixels = work.pixels * narrower**2
-    share = min(1.0, FEATURES_PER_PX * pixels / settings.n_features)
-    of_pair = PAIR_SECONDS[0] + PAIR_SECONDS[1] * share**2 * (settings.n_features / USUAL_FEATURES) ** 2
-    return work.frames * (FEATURE_SECONDS_PER_PX * pixels + MAPPING_SECONDS) + pairs * of_pair
-
-
-def _pixels_of_depth(work: Workload) -> float:
-    """Of an image as depth is estimated from it."""
-    share = 1.0 if work.width is None else min(1.0, work.config.depth.max_width / float(work.width))
-    return float(work.pixels) * share**2
 
 
 @dataclass

@@ -28,27 +28,29 @@ REGISTRY: tuple[Stage, ...] = (
     ),
     Stage(
         name="poses",
+        costs_by_settings=True,
         other_parts=("poses",),
         tasks=(
             StageTask(
                 name="poses",
-                cost=Cost(
-                    terms=("one", "frames", "frames*pixels"),
-                    unfitted="pairs of frames are no term: `flows.estimate` has a formula of its own",
-                ),
+                cost=Cost(terms=("frames", "frames*feature_pixels", "pairs", "pairs*features*features")),
             ),
         ),
     ),
     Stage(
         name="depth",
+        costs_by_settings=True,
         page_parts=("depth",),
         tasks=(
             StageTask(
                 name="depth",
                 cost=Cost(
-                    terms=("one", "train", "train*pixels"),
-                    unfitted="the pixels that it looks at (`depth.max_width`) are no term",
-                    usual_s=30.0,
+                    terms=(
+                        "train",
+                        "train*pixels",
+                        "train*matched_pixels",
+                        "train*matched_pixels*hypotheses",
+                    )
                 ),
             ),
         ),
@@ -159,6 +161,7 @@ REGISTRY: tuple[Stage, ...] = (
                         "fold_iterations",
                         "fold_iterations*restored",
                         "fold_iterations*gaussians",
+                        "judge_pairs*restored",
                     ),
                     # Blending and filling need no preparation.
                     runs=lambda config: config.enhance.backend != "classical",

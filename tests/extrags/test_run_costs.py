@@ -120,8 +120,11 @@ class TestWorkloadSettings:
         quick = profile_config("quick")
         known = settings_of(PipelineConfig)
         read = set()
-        # Some are read only without densification, or where starts outnumber trajectories.
-        other = quick.with_overrides({"coarse.densify.enabled": False, "explore.trajectories": 3})
+        # Some are read only without densification, where starts outnumber trajectories, or in recordings of
+        # more frames than are all matched with one another.
+        other = quick.with_overrides(
+            {"coarse.densify.enabled": False, "explore.trajectories": 3, "poses.exhaustive_below": 10}
+        )
         for base in (quick, other):
             before = costs(base)
             for name, setting in known.items():
@@ -327,3 +330,43 @@ class TestPackaged:
     def test_survives_json(self) -> None:
         model = packaged_model()
         assert CostModel.from_json(model.to_json()) == model
+
+
+class TestOwnVideo:
+    """Poses and depth of a recording that brings neither."""
+
+    def test_what_poses_and_depth_took(self) -> None:
+        """Processor time of recorded stages, divided by how much slower that machine was (1.19)."""
+        quick = profile_config("quick")
+        model = packaged_model()
+        for task, width, height, frames, train, seconds in (
+            ("depth", 160, 128, 48, 20, 10.0),
+            ("depth", 256, 205, 48, 20, 31.8),
+            ("depth", 675, 540, 40, 20, 28.2),
+            ("poses", 675, 540, 40, 20, 165.0),
+        ):
+            item = Workload(width * height, frames, train, frames - train, quick, width=width)
+            assert model.predict(task, item).seconds == pytest.approx(seconds, rel=0.25), (task, width)
+
+    def test_pairs_of_frames_grow_with_the_frames_of_long_recordings(self) -> None:
+        quick = profile_config("quick")
+        pairs = [
+            Workload(20_480, train, train, 0, quick, width=160).numbers()["pairs"]
+            for train in (60, 600, 6000)
+        ]
+        assert pairs[0] == 60 * 59 / 2
+        assert pairs[1] < 7 * pairs[0]
+        assert pairs[2] < 11 * pairs[1]
+
+    def test_fewer_hypotheses_and_partners_take_less_time(self) -> None:
+        quick = profile_config("quick")
+
+        def seconds(**changes: int) -> float:
+            config = quick.with_overrides({f"depth.{name}": value for name, value in changes.items()})
+            return packaged_model().predict("depth", replace(work(), config=config)).seconds
+
+        assert seconds(hypotheses=48) < seconds() < seconds(hypotheses=192)
+        assert seconds(sources=3) < seconds()
+        assert beyond_the_fit("depth", quick) == ()
+        assert beyond_the_fit("depth", quick.with_overrides({"depth.monocular": "network"}))
+        assert beyond_the_fit("poses", quick.with_overrides({"poses.fallback": "rgbd"}))

@@ -83,7 +83,8 @@ class TestEstimate:
             sum(expected_seconds(config, replace(usual_work(config), pixels=p, width=w))["depth"].values())
             for p, w in ((160 * 128, 160), (256 * 144, 256), (1920 * 1080, 1920))
         ]
-        assert depths[1] == pytest.approx(depths[0] * 256 * 144 / (160 * 128))
+        # Nearly in proportion to the pixels that are matched: something is done once a frame.
+        assert 0.9 * 256 * 144 / (160 * 128) < depths[1] / depths[0] < 256 * 144 / (160 * 128)
         assert depths[2] == pytest.approx(depths[1])
 
     def test_the_usual_pace_counts_before_something_ran(self) -> None:
