@@ -60,8 +60,8 @@ GROWN_FROM_START = 1.5
 eight reached their limit, which was that; the others ended at 1.24 to 1.44."""
 FINAL_WANTED = 5.0
 """The same after fine-tuning, as a multiple: 3.4 and 7.4 in the two scenes whose limit was far away."""
-FEATURES_PER_PX = 0.04
-"""About so many are found in small frames, where `poses.n_features` does not bound them."""
+FEATURES_PER_PX = 0.02
+"""About so many are found, where `poses.n_features` does not bound them."""
 REWEIGHTED = 20
 """Rounds of reweighting; the fit has settled by then."""
 PRIOR_RECORDS = 2.0

@@ -33,7 +33,8 @@ REGISTRY: tuple[Stage, ...] = (
         tasks=(
             StageTask(
                 name="poses",
-                cost=Cost(terms=("frames", "frames*feature_pixels", "pairs", "pairs*features*features")),
+                # Of one attempt: whether COLMAP needs a second one is not known before.
+                cost=Cost(terms=("frames*feature_pixels", "pairs*features*features")),
             ),
         ),
     ),

@@ -66,8 +66,10 @@ class TestEstimate:
             return sum(expected_seconds(config, work)["poses"].values())
 
         for recorded, size in (
-            (20, (160, 128, 48, 20)),
-            (170, (675, 540, 40, 20)),
+            (3.6, (160, 128, 48, 20)),
+            (19.3, (320, 256, 48, 20)),
+            (2.3, (237, 237, 10, 8)),
+            (165, (675, 540, 40, 20)),
             (208, (1048, 972, 35, 30)),
         ):
             assert expected(*size) == pytest.approx(recorded, rel=0.25)
