@@ -7,13 +7,14 @@ through the activations (exponential, sigmoid) is explicit.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from extrags.errors import NonFiniteError, ShapeError
@@ -39,6 +40,8 @@ class Target:
         normalisation: pixels that the weighted sums are divided by; None is the sum of `weight`.
         depth: z-depth in world units, 0 where there is none, [H, W].
         depth_confidence: weight of the depth term per pixel, in [0, 1], [H, W]; None weights all equally.
+        shown: pixels that belong to the picture, [H, W]; elsewhere the colour terms take rendering and target
+            for black, as beyond the edge of the image. None: all.
 
     Raises:
         ShapeError: when sizes do not fit together, or that of the image is out of range.
@@ -58,6 +61,7 @@ class Target:
         normalisation: float | None = None,
         depth: Float[Tensor, "h w"] | None = None,
         depth_confidence: Float[Tensor, "h w"] | None = None,
+        shown: Bool[Tensor, "h w"] | None = None,
     ) -> None:
         if rgb.ndim != 3 or rgb.shape[2] != 3:
             raise ShapeError(f"rgb has shape {tuple(rgb.shape)}, expected (H, W, 3)")
@@ -78,6 +82,11 @@ class Target:
         for name, image in images.items():
             if image is not None and image.shape != (self.height, self.width):
                 raise ShapeError(f"{name} has shape {image.shape}, expected {(self.height, self.width)}")
+        self.hidden = None if shown is None else _hidden_pixels(shown, self.rgb.shape[:2])
+        if self.hidden is not None:
+            # The view's own colours may be in this memory.
+            self.rgb = self.rgb.copy()
+            self.rgb.reshape(-1, 3)[self.hidden] = 0
         self.viewmat = np.ascontiguousarray(viewmat, dtype=np.float32)
         self.K = np.ascontiguousarray(K, dtype=np.float32)
         self.lens = None if lens is None else lens.packed()
@@ -94,6 +103,13 @@ class Target:
 
 def _contiguous_array(values: Tensor) -> np.ndarray:
     return values.detach().to(torch.float32).contiguous().numpy()
+
+
+def _hidden_pixels(shown: Tensor, size: tuple[int, ...]) -> np.ndarray:
+    """Flat indices of the pixels that are not shown."""
+    if shown.shape != size:
+        raise ShapeError(f"shown has shape {tuple(shown.shape)}, expected {size}")
+    return np.flatnonzero(~shown.numpy())
 
 
 @dataclass(frozen=True)
@@ -129,15 +145,16 @@ class _Images:
     ) -> tuple[float, Any]:
         """The loss, and the kernels' struct of its gradients with respect to the images."""
         kernels, image = native.compiled_kernels(), self.arrays
-        loss: float = kernels.l1_ssim(
-            image["rgb"],
-            target.rgb,
-            target.weight,
-            image["v_rgb"],
-            dssim_weight,
-            rgb_weight,
-            ssim_mask=target.ssim_weight,
-        )
+        with self._blank(target.hidden):
+            loss: float = kernels.l1_ssim(
+                image["rgb"],
+                target.rgb,
+                target.weight,
+                image["v_rgb"],
+                dssim_weight,
+                rgb_weight,
+                ssim_mask=target.ssim_weight,
+            )
         gradients = {"rgb": image["v_rgb"]}
         if target.depth is not None and depth_weight > 0:
             images = image["depth"], image["alpha"], target.depth, image["v_depth"]
@@ -157,6 +174,19 @@ class _Images:
             if compared:
                 gradients |= {"depth": image["v_depth"], "depth_image": image["depth"]}
         return loss, kernels.ImageGradients(**gradients)
+
+    @contextmanager
+    def _blank(self, hidden: np.ndarray | None) -> Iterator[None]:
+        """Pixels black, as the loss sees them, and without a gradient; the rendering keeps its colours."""
+        if hidden is None:
+            yield
+            return
+        colors = self.arrays["rgb"].reshape(-1, 3)
+        rendered = colors[hidden]
+        colors[hidden] = 0
+        yield
+        colors[hidden] = rendered
+        self.arrays["v_rgb"].reshape(-1, 3)[hidden] = 0
 
 
 class DirectStep:

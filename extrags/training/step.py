@@ -117,9 +117,13 @@ class AutogradStep:
             absgrad=density.needs_absgrad,
         )
         like = rendering.rgb
+        image, target = rendering.rgb[0], view.colors.to(like)
+        if view.shown is not None:
+            hidden = ~view.shown.to(like.device)[..., None]
+            image, target = image.masked_fill(hidden, 0), target.masked_fill(hidden, 0)
         loss = schedule.photometric_weight * l1_ssim_loss(
-            rendering.rgb[0],
-            view.colors.to(like),
+            image,
+            target,
             dssim_weight=schedule.dssim_weight,
             mask=view.weights.to(like),
             ssim_mask=None if view.ssim_weight is None else view.ssim_weight.to(like),
@@ -257,6 +261,7 @@ class NativeStep:
             normalisation=view.normalisation,
             depth=view.depth_mm if self._schedule.depth_weight > 0 else None,
             depth_confidence=view.depth_confidence,
+            shown=view.shown,
         )
 
 

@@ -39,6 +39,8 @@ class View:
         normalisation: pixels that the weighted sums of the colour terms are divided by; None is the sum of
             `weight`, which makes them weighted means.
         depth_confidence: weight of the depth term per pixel, in [0, 1], [H, W]; None is one.
+        shown: pixels that belong to the picture, [H, W]; what lies beyond its mask is black in rendering and
+            target, as beyond the edge of the image, so that no window of SSIM compares it. None: all.
         least_weight: what smaller weights of pixels are raised to where they are stored in steps.
         weight_factor: of all weights of pixels.
     """
@@ -52,6 +54,7 @@ class View:
     ssim_weight: Float[Tensor, "h w"] | None = None
     normalisation: float | None = None
     depth_confidence: Float[Tensor, "h w"] | None = None
+    shown: Bool[Tensor, "h w"] | None = None
     least_weight: float = 0.0
     weight_factor: float = 1.0
 
@@ -143,9 +146,9 @@ def real_views(sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]) -> li
         # A saturated channel says nothing about albedo.
         weight = sequence.supervised_mask(index) & ~saturated_mask(sequence.rgb[index])
         depth = confidence = None
+        mask = sequence.mask[index]
         if sequence.depth_mm is not None:
             depth = sequence.depth_mm[index]
-            mask = sequence.mask[index]
             if depth.dtype != np.float32 or depth[~mask].any():
                 depth = depths.append(np.where(mask, depth, 0).astype(np.float32))
             depth = _shared(depth)
@@ -159,6 +162,7 @@ def real_views(sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]) -> li
                 depth_mm=depth,
                 frame=position,
                 depth_confidence=confidence,
+                shown=None if mask.all() else _shared(mask),
             )
         )
     return views

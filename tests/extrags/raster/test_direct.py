@@ -81,6 +81,35 @@ def test_equals_autograd(degree: int, absgrad: bool, isa: str) -> None:
     assert torch.equal(direct.visible, direct.rendering(target).visible[0])
 
 
+def test_the_edge_of_a_mask_is_like_the_edge_of_an_image(isa: str) -> None:
+    """A rectangle that is shown is the smaller image: no window of SSIM reaches beyond it."""
+    parameters, whole = _parameters(), _target()
+    left, top, right, bottom = 9, 6, 50, 37
+    shown = torch.zeros(whole.height, whole.width, dtype=torch.bool)
+    shown[top:bottom, left:right] = True
+    rgb = torch.from_numpy(whole.rgb)
+    target = Target(whole.viewmat, whole.K, rgb, weight=shown.float(), shown=shown)
+    direct = DirectStep()
+    direct.bind(parameters)
+    loss = direct.run(target, sh_degree=1, dssim_weight=0.3)
+    leaves = {name: value.clone().requires_grad_() for name, value in parameters.items()}
+    rendering = rasterize(
+        leaves["means"], leaves["quats"], leaves["scales"].exp(), leaves["opacities"].sigmoid(), leaves["sh"],
+        torch.from_numpy(whole.viewmat)[None], torch.from_numpy(whole.K)[None], whole.width, whole.height,
+        sh_degree=1,
+    )  # fmt: skip
+    window = slice(top, bottom), slice(left, right)
+    expected = l1_ssim_loss(rendering.rgb[0][window], rgb[window], dssim_weight=0.3)
+    expected.backward()
+    assert loss == pytest.approx(float(expected.detach()), rel=1e-6)
+    for name in NAMES:
+        gradient = leaves[name].grad
+        assert gradient is not None
+        assert relative_l2(direct.gradients[name], gradient.double()) < 1e-5, name
+    # The caller's colours are left as they were.
+    assert torch.equal(rgb, torch.from_numpy(_target().rgb))
+
+
 def test_arrays_stay_while_the_number_of_gaussians_does() -> None:
     parameters = _parameters()
     direct = DirectStep()
@@ -173,6 +202,8 @@ def test_targets_are_checked(unchecked: None) -> None:
         Target(np.eye(4), eye, rgb, weight=torch.zeros(5, 4))
     with pytest.raises(ShapeError, match="ssim_weight has shape"):
         Target(np.eye(4), eye, rgb, ssim_weight=torch.zeros(5, 4))
+    with pytest.raises(ShapeError, match="shown has shape"):
+        Target(np.eye(4), eye, rgb, shown=torch.zeros(5, 4, dtype=torch.bool))
     with pytest.raises(NonFiniteError, match="Ks"):
         Target(np.eye(4), eye * np.nan, rgb)
 

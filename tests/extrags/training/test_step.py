@@ -42,6 +42,15 @@ def _weighted(view: View) -> View:
     return replace(view, weight=weight)
 
 
+def _masked(view: View) -> View:
+    """The picture of a scope: round, with something beyond its edge that no loss may see."""
+    rows, columns = torch.meshgrid(
+        *(torch.linspace(-1, 1, side) for side in view.weight.shape), indexing="ij"
+    )
+    shown = rows**2 + columns**2 < 0.7
+    return replace(view, weight=shown, shown=shown)
+
+
 SETTINGS: dict[str, DensifyConfig] = {
     "none": DensifyConfig(enabled=False),
     "absgrad": DensifyConfig(absgrad=True),
@@ -51,7 +60,7 @@ SETTINGS: dict[str, DensifyConfig] = {
 
 class TestOneStep:
     @pytest.mark.parametrize("lit", [True, False])
-    @pytest.mark.parametrize("change", [_weighted, _virtual])
+    @pytest.mark.parametrize("change", [_weighted, _virtual, _masked])
     @pytest.mark.parametrize("setting", SETTINGS)
     def test_loss_and_gradients_are_those_of_autograd(
         self, tube_sequence: EndoscopicSequence, setting: str, change: Callable[[View], View], lit: bool
@@ -89,6 +98,35 @@ class TestOneStep:
                 exposure = torch.from_numpy(native_step.light_fit.exposure_gradient(row))
                 assert expected.light.log_exposure.grad is not None
                 assert relative_error(exposure, expected.light.log_exposure.grad) < 1e-5
+
+    @pytest.mark.parametrize("native_kernels", [True, False])
+    def test_what_is_beyond_the_mask_has_no_say(
+        self, tube_sequence: EndoscopicSequence, native_kernels: bool
+    ) -> None:
+        masked = _masked(real_views(tube_sequence, tube_sequence.train)[1])
+        assert masked.shown is not None
+        beyond = ~masked.shown
+        others = masked.rgb.clone()
+        others[beyond] = 255 - others[beyond]
+        schedule = step_schedule()
+        scene = shaken_scene(lit=True)
+        density = density_strategy(schedule.densify, 20.0, 30, len(scene.gaussians), seed=0)
+        found = []
+        for view in (masked, replace(masked, rgb=others)):
+            step = NativeStep(scene, schedule) if native_kernels else AutogradStep(scene, schedule)
+            observation = step.differentiate(view, 7, density)
+            if isinstance(step, NativeStep):
+                assert step.direct is not None
+                gradient = step.direct.gradients["means"].clone()
+            else:
+                means = step.adam.parameters["means"].grad
+                assert means is not None
+                gradient = means.clone()
+            # The rendering is shown as it is, not as the loss saw it.
+            assert float(observation.rendering.rgb[0][beyond].detach().max()) > 0
+            found.append((observation.loss, gradient))
+        assert found[0][0] == found[1][0]
+        assert torch.equal(found[0][1], found[1][1])
 
     @pytest.mark.parametrize("iteration", [3, 4000])
     @pytest.mark.parametrize("degree", [0, 1, 3])
