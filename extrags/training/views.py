@@ -140,7 +140,9 @@ def real_views(sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]) -> li
     cameras = sequence.cameras
     count = len(frames)
     weights, depths, confidences = FrameStack(count), FrameStack(count), FrameStack(count)
+    masks = FrameStack(count)
     views = []
+    picture: np.ndarray | None = None
     for position, frame in enumerate(frames):
         index = int(frame)
         # A saturated channel says nothing about albedo.
@@ -152,6 +154,12 @@ def real_views(sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]) -> li
             if depth.dtype != np.float32 or depth[~mask].any():
                 depth = depths.append(np.where(mask, depth, 0).astype(np.float32))
             depth = _shared(depth)
+        shown = None
+        if not mask.all():
+            # Most recordings have one for all frames.
+            if picture is None or not np.array_equal(picture, mask):
+                picture = masks.append(mask)
+            shown = _shared(picture)
         if sequence.depth_error is not None:
             confidence = _shared(confidences.append(depth_confidence(sequence.depth_error[index])))
         views.append(
@@ -162,7 +170,7 @@ def real_views(sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]) -> li
                 depth_mm=depth,
                 frame=position,
                 depth_confidence=confidence,
-                shown=None if mask.all() else _shared(mask),
+                shown=shown,
             )
         )
     return views

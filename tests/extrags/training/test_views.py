@@ -66,6 +66,21 @@ class TestRealViews:
         assert view.depth_mm.data_ptr() == tube_sequence.depth_mm[frame].ctypes.data
         assert view.weight.element_size() == 1
 
+    def test_one_mask_of_all_frames_is_held_once(self, tube_sequence: EndoscopicSequence) -> None:
+        mask = np.ones_like(tube_sequence.mask)
+        mask[:, :3] = False
+        mask[tube_sequence.train[-1], 3] = False
+        views = real_views(replace(tube_sequence, mask=mask), tube_sequence.train)
+        for view, frame in zip(views, tube_sequence.train, strict=True):
+            assert view.shown is not None
+            assert np.array_equal(view.shown.numpy(), mask[frame])
+        held = {view.shown.data_ptr() for view in views if view.shown is not None}
+        assert len(held) == 2
+        assert len(views) > 2
+        # Where all belongs to the picture nothing is held.
+        plain = replace(tube_sequence, mask=np.ones_like(mask))
+        assert all(view.shown is None for view in real_views(plain, plain.train))
+
     def test_frames_that_cannot_be_written_are_copied(self, sequence: EndoscopicSequence) -> None:
         fixed = sequence.rgb.copy()
         fixed.flags.writeable = False
