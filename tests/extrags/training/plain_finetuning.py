@@ -162,6 +162,7 @@ class Plain:
     unknown_above: float = 0.5
     inverse: bool = True
     swap_lambda: bool = False
+    beyond_mask: float = 0.0
 
     def photometric(
         self, image: Tensor, target: Tensor, weight: Tensor, ssim_weight: Tensor, z: float, lam: float
@@ -209,8 +210,10 @@ class Plain:
         rgb = double(sequence.rgb[frame] / np.float32(255))
         valid = double(sequence.mask[frame] & (sequence.rgb[frame] < 250).all(-1))
         lam = coarse.dssim_weight if config.dssim_weight is None else config.dssim_weight
+        # Beyond the mask as beyond the edge of the image: black, in windows of SSIM too.
+        seen = double(np.where(sequence.mask[frame], 1, self.beyond_mask))[..., None]
         loss = config.photometric_weight * self.photometric(
-            images.rgb, rgb, valid, valid, float(valid.sum()), lam
+            seen * images.rgb, seen * rgb, valid, valid, float(valid.sum()), lam
         )
         depth = double(np.where(sequence.mask[frame], sequence.depth_mm[frame], 0))
         weight = plain_depth_weight(config, coarse, iteration)
