@@ -415,9 +415,12 @@ def fitted(history: Sequence[tuple[Workload, TaskCost]], probe_s: float) -> Cost
 
 def memory_terms(task: str) -> tuple[str, ...]:
     """Terms of the memory of a task."""
+    stage = stage_of_task(task)
+    if stage is not None and stage.name in ("poses", "depth"):
+        # There are no views to restore yet.
+        return tuple(term for term in MEMORY_TERMS if term != "views*restored")
     if not cost_of(task).of_final_scene:
         return MEMORY_TERMS
-    stage = stage_of_task(task)
     measured = EVALUATION_TERMS if stage is not None and stage.name == "evaluate" else ()
     return (*("final_gaussians" if term == "gaussians" else term for term in MEMORY_TERMS), *measured)
 

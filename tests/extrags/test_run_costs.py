@@ -370,3 +370,10 @@ class TestOwnVideo:
         assert beyond_the_fit("depth", quick) == ()
         assert beyond_the_fit("depth", quick.with_overrides({"depth.monocular": "network"}))
         assert beyond_the_fit("poses", quick.with_overrides({"poses.fallback": "rgbd"}))
+
+    @pytest.mark.parametrize("task", ["poses", "depth"])
+    def test_neither_takes_memory_for_virtual_views(self, task: str) -> None:
+        quick = profile_config("quick")
+        few, many = (Workload(20_480, 48, 24, 24, quick, views=views, width=160) for views in (20, 2000))
+        model = packaged_model()
+        assert model.predict(task, few).peak_mib == model.predict(task, many).peak_mib
