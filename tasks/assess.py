@@ -26,8 +26,10 @@ _OF_BUDGETS = (
 _OF_RESTORER = ("enhance.backend", "enhance.judge", "enhance.steps", "enhance.train_iterations")
 """Settings that say what will restore the virtual views."""
 
-_OF_SAVINGS = tuple(name for name in WORKLOAD_SETTINGS if not name.startswith("evaluate."))
-"""Settings that what a stage costs depends on; nothing is decided on the evaluation."""
+_OF_SAVINGS = tuple(
+    name for name in WORKLOAD_SETTINGS if name.partition(".")[0] not in ("poses", "depth", "evaluate")
+)
+"""Settings that what a stage costs depends on; nothing is decided on the evaluation, nor on what has run."""
 
 
 def measuring_settings(config: AssessConfig) -> AssessConfig:
