@@ -28,8 +28,9 @@ def explore_ply(ply: Path, source: str, folder: Path, config: extrags.PipelineCo
     """
     scene = extrags.Scene(extrags.Gaussians.read_ply(ply))
     sequence = extrags.read(source, config.ingest)
-    mesh = extrags.fuse_surface(scene, sequence.training_cameras, config.surface)
-    space = extrags.carve(scene, mesh, sequence.training_cameras, config.freespace)
+    cameras, masks = sequence.training_cameras, sequence.training_masks
+    mesh = extrags.fuse_surface(scene, cameras, config.surface, masks=masks)
+    space = extrags.carve(scene, mesh, cameras, config.freespace, masks=masks)
     found = extrags.explore(scene, sequence, config.explore, freespace=space)
     folder.mkdir(parents=True, exist_ok=True)
     for index, (cameras, gain) in enumerate(zip(found.trajectories, found.gains, strict=True)):

@@ -8,7 +8,6 @@ import math
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from torch.nn import functional
 
 from extrags.cameras import Cameras, rotation_about
 from extrags.config import DEFAULT_PROFILE, PROFILES, AssessConfig, CoverageConfig, PipelineConfig
@@ -20,6 +19,7 @@ from extrags.raster import Rendering
 from extrags.scene import Scene
 from extrags.scene_plan import ScenePlan, decide
 from extrags.sequence import EndoscopicSequence
+from extrags.shown_pixels import shown_pixels
 from extrags.threads import one_torch_thread
 
 __all__ = ["assess", "measure", "probe_views"]
@@ -32,8 +32,6 @@ PROBE_CLEARANCE_SHARE = 0.2
 """Smallest distance of a probe camera from solid Gaussians, in median rendered depths."""
 SOLID_OPACITY = 0.5
 PROBES_PER_BATCH = 8
-WHOLE = 0.999
-"""Share of a small pixel's area from which it counts as wholly inside a mask; the rest is rounding."""
 
 
 def assess(scene: Scene, sequence: EndoscopicSequence, config: PipelineConfig | None = None) -> ScenePlan:
@@ -82,7 +80,7 @@ def measure(
     Raises:
         CaptureError: when there are no Gaussians, or no training view sees any.
     """
-    cameras = sequence.cameras[sequence.train]
+    cameras = sequence.training_cameras
     if len(scene.gaussians) == 0 or len(cameras) == 0:
         raise CaptureError(
             f"{sequence.name}: nothing to assess with {len(scene.gaussians)} Gaussians "
@@ -91,7 +89,7 @@ def measure(
     # Blending weights come from the native kernels, and the search tree is on the processor.
     on_processor = scene.to("cpu")
     small = cameras.at_most_width(coverage.render_width)
-    valid = _valid_pixels(sequence, small)
+    valid = shown_pixels(sequence.training_masks, cameras, small)
     depth_unit_mm, training_holes = _training_view_measurements(scene, small, valid, settings)
     covered = training_coverage(on_processor, small, **coverage.options, mask=valid)
     directions = direction_counts(covered)
@@ -171,21 +169,6 @@ def probe_views(scene: Scene, cameras: Cameras, depth_unit_mm: float, config: As
         poses.append(pose)
     K = cameras.K[anchors[np.arange(config.probe_views) % len(anchors)]]
     return Cameras(K, np.stack(poses), cameras.width, cameras.height)
-
-
-def _valid_pixels(sequence: EndoscopicSequence, cameras: Cameras) -> Bool[np.ndarray, "v h w"]:
-    """Pixels of the training views, at the size of `cameras`, all of whose area shows tissue.
-
-    Of a frame without such a pixel (a speckled mask, a small field) those that show some.
-    """
-    size = (cameras.height, cameras.width)
-    found = np.zeros((len(cameras), *size), dtype=bool)
-    for index, frame in enumerate(sequence.train):
-        mask = torch.from_numpy(sequence.mask[int(frame)]).float()[None, None]
-        share = functional.interpolate(mask, size, mode="area")[0, 0].numpy()
-        whole = share > WHOLE
-        found[index] = whole if whole.any() else share > 0
-    return np.asarray(found & cameras.field)
 
 
 def _training_view_measurements(

@@ -248,7 +248,10 @@ class InMemoryPipeline(Pipeline):
 
         with self._timed("surface"):
             self.result.mesh = fuse_surface(
-                self.result.coarse, self._training.training_cameras, self.config.surface
+                self.result.coarse,
+                self._training.training_cameras,
+                self.config.surface,
+                masks=self._training.training_masks,
             )
 
     def freespace(self) -> None:
@@ -264,6 +267,7 @@ class InMemoryPipeline(Pipeline):
                 self._training.training_cameras,
                 self.config.freespace,
                 surface_error_mm=surface_error_mm(mesh, self._training),
+                masks=self._training.training_masks,
             )
 
     def explore(self) -> None:

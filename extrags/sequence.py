@@ -198,6 +198,12 @@ class EndoscopicSequence(Storable):
         """
         return self.cameras[self.train]
 
+    @property
+    def training_masks(self) -> list[Bool[np.ndarray, "h w"]] | None:
+        """Masks of the training frames, in the memory of `mask`; None where all their pixels show tissue."""
+        masks = [self.mask[frame] for frame in self.train]
+        return None if all(bool(mask.all()) for mask in masks) else masks
+
     @cached_property
     def training_depth_known(self) -> bool:
         """Whether any training frame has depth: held-out frames may have some for the evaluation alone."""

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, cast
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from extrags.cameras import Cameras
 from extrags.config import DEFAULT_PROFILE, PROFILES, SurfaceConfig
@@ -22,6 +22,7 @@ from extrags.frame_stacks import FrameStack
 from extrags.output_files import whole_file
 from extrags.radial_lens import WIDE_FIELD_DEG
 from extrags.scene import Scene
+from extrags.shown_pixels import chosen_masks, shown_pixels
 from extrags.store.storable import Storable
 from extrags.threads import one_torch_thread
 from extrags.unique_rows import unique_rows
@@ -103,7 +104,13 @@ def write_triangle_ply(path: Path, vertex: np.ndarray, triangles: Int[np.ndarray
 
 
 @one_torch_thread()
-def fuse_surface(scene: Scene, cameras: Cameras, config: SurfaceConfig | None = None) -> Mesh:
+def fuse_surface(
+    scene: Scene,
+    cameras: Cameras,
+    config: SurfaceConfig | None = None,
+    *,
+    masks: Sequence[Bool[np.ndarray, "h w"]] | None = None,
+) -> Mesh:
     """Mesh of the surface visible in the views, by TSDF fusion of the scene's median depth.
 
     Voxel size and truncation distance are set from depth quantiles over all views: in a tubular organ there
@@ -113,24 +120,31 @@ def fuse_surface(scene: Scene, cameras: Cameras, config: SurfaceConfig | None = 
         scene: the reconstructed scene.
         cameras: the training views.
         config: settings; None takes those of the profile `balanced`.
+        masks: pixels of each view that show tissue (`EndoscopicSequence.training_masks`), at the size of
+            `cameras`: beyond the edge of a scope's picture nothing was seen. None: all.
 
     Returns:
         The mesh in canonical order: the same inputs give the same bits.
 
     Raises:
         CaptureError: when the views see no surface.
+        ShapeError: for masks of other views.
     """
     config = PROFILES[DEFAULT_PROFILE].surface if config is None else config
     if not len(cameras):
         raise CaptureError("no views to fuse the surface from")
-    views, depth = rendered_depth(scene, cameras, config)
+    views, depth = rendered_depth(scene, cameras, config, masks=masks)
     return fuse_depth(views, depth, config)
 
 
 def rendered_depth(
-    scene: Scene, cameras: Cameras, config: SurfaceConfig
+    scene: Scene,
+    cameras: Cameras,
+    config: SurfaceConfig,
+    *,
+    masks: Sequence[Bool[np.ndarray, "h w"]] | None = None,
 ) -> tuple[Cameras, Float[np.ndarray, "c h w"]]:
-    """Median z-depth of all views, 0 where alpha is too low.
+    """Median z-depth of all views, 0 where alpha is too low and where they show no tissue.
 
     The median is fused, not the expected depth, because at occlusion edges the expected depth lies between
     the foreground and the background surface.
@@ -139,22 +153,26 @@ def rendered_depth(
         scene: the reconstructed scene.
         cameras: the views.
         config: settings; images wider than `max_width` are rendered smaller.
+        masks: as `fuse_surface`.
 
     Returns:
         The cameras at the size rendered, wide pinholes in place of a lens, and their depth.
     """
     # The median depth comes from the native kernels, and Open3D fuses it there.
     scene = scene.to("cpu")
-    cameras = cameras.as_pinholes(WIDE_FIELD_DEG).at_most_width(config.max_width)
-    found = FrameStack(len(cameras))
+    views = cameras.as_pinholes(WIDE_FIELD_DEG).at_most_width(config.max_width)
+    found = FrameStack(len(views))
     with torch.no_grad():
-        for start in range(0, len(cameras), VIEWS_PER_BATCH):
-            batch = scene.render(cameras[start : start + VIEWS_PER_BATCH], median_depth=True)
+        for start in range(0, len(views), VIEWS_PER_BATCH):
+            part = np.arange(start, min(start + VIEWS_PER_BATCH, len(views)))
+            batch = scene.render(views[part], median_depth=True)
             depth = cast("torch.Tensor", batch.median_depth)
-            for view in torch.where(batch.alpha >= config.min_alpha, depth, 0.0).numpy():
+            shown = shown_pixels(chosen_masks(masks, cameras, part), cameras[part], views[part])
+            solid = (batch.alpha >= config.min_alpha) & torch.from_numpy(shown)
+            for view in torch.where(solid, depth, 0.0).numpy():
                 found.append(view.astype(np.float32, copy=False))
-            emit(Progress("surface", min(start + VIEWS_PER_BATCH, len(cameras)), len(cameras)))
-    return cameras, found.array
+            emit(Progress("surface", len(found), len(views)))
+    return views, found.array
 
 
 def fuse_depth(cameras: Cameras, depth_mm: Float[np.ndarray, "c h w"], config: SurfaceConfig) -> Mesh:

@@ -67,7 +67,13 @@ class ReconstructedScene:
         """Where a virtual camera can go."""
         config = self.config.explore
         config = config.model_copy(update={"trajectories": _trajectories(config, n_views)})
-        context = prepare_search(self.scene, self.training.training_cameras, self.space, config)
+        context = prepare_search(
+            self.scene,
+            self.training.training_cameras,
+            self.space,
+            config,
+            masks=self.training.training_masks,
+        )
         return Moves(self.space, context.depth_unit_mm, config)
 
     def cameras(self, poses: np.ndarray) -> Cameras:

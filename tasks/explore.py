@@ -23,7 +23,7 @@ __all__ = ["branch", "explore", "merge", "next_anchors", "start"]
 NEXT_ANCHORS = "next_anchors"
 
 
-@stage("explore-start", version=6)
+@stage("explore-start", version=7)
 def start(slot: Slot, scene: Ref, sequence: Ref, freespace: Ref, config: ExploreConfig) -> None:
     """Measure the scene and choose the anchors; writes `search/` and `state/`."""
     from extrags.exploration import prepare_search, start_exploration
@@ -31,9 +31,14 @@ def start(slot: Slot, scene: Ref, sequence: Ref, freespace: Ref, config: Explore
     from extrags.scene import Scene
     from extrags.sequence import EndoscopicSequence
 
-    cameras = slot.load(EndoscopicSequence, sequence).training_cameras
-    space = slot.load(FreeSpace, freespace)
-    context = prepare_search(slot.load(Scene, scene), cameras, space, config)
+    frames = slot.load(EndoscopicSequence, sequence)
+    context = prepare_search(
+        slot.load(Scene, scene),
+        frames.training_cameras,
+        slot.load(FreeSpace, freespace),
+        config,
+        masks=frames.training_masks,
+    )
     slot.save(context.measured)
     _write_state(slot, start_exploration(context))
     slot.counts.update(renders=context.measured.renders)

@@ -9,7 +9,7 @@ from tasks.stage import stage
 __all__ = ["freespace"]
 
 
-@stage("freespace", version=5)
+@stage("freespace", version=6)
 def freespace(slot: Slot, scene: Ref, surface: Ref, sequence: Ref, config: FreespaceConfig) -> None:
     """Carve the space the training views look through; writes `freespace/`."""
     from extrags.freespace import carve
@@ -26,6 +26,7 @@ def freespace(slot: Slot, scene: Ref, surface: Ref, sequence: Ref, config: Frees
         frames.training_cameras,
         config,
         surface_error_mm=surface_error_mm(mesh, frames),
+        masks=frames.training_masks,
     )
     slot.save(space)
     slot.counts.update(grid_size=space.grid_size, free_share=round(space.free_share, 4))

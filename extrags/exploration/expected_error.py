@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from extrags.cameras import Cameras, rotation_about
 from extrags.config import ExploreConfig
@@ -22,7 +22,6 @@ from extrags.exploration.frontier import Frontier
 from extrags.exploration.seen import ErrorValue, Seen
 from extrags.freespace import FREE, FreeSpace
 from extrags.raster import Rendering
-from extrags.thresholds import HOLE_ALPHA
 
 __all__ = ["CLEARANCE_ROUNDING", "SizeModel", "Sizes", "measure_sizes", "probe_cameras", "sizes_in"]
 
@@ -115,17 +114,19 @@ def _directions(generator: np.random.Generator) -> Float[np.ndarray, "2 3"]:
     return np.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))
 
 
-def sizes_in(rendering: Rendering, cameras: Cameras, frontier: Frontier) -> list[Sizes]:
+def sizes_in(
+    rendering: Rendering, cameras: Cameras, frontier: Frontier, holes: Bool[np.ndarray, "c h w"]
+) -> list[Sizes]:
     """Sizes of all rows in rendered views.
 
     Args:
         rendering: of the views, with `visibility`.
         cameras: the views.
         frontier: where views through holes leave free space.
+        holes: pixels without a surface.
     """
     assert rendering.visibility_sum is not None
     sums = rendering.visibility_sum.numpy()
-    holes = rendering.alpha.numpy() < HOLE_ALPHA
     found = []
     for index in range(len(cameras)):
         gaussians = np.flatnonzero(sums[index] > SMALLEST_SIZE_PX).astype(np.int32)

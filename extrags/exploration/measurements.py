@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from jaxtyping import Float, Int, UInt32
+from jaxtyping import Bool, Float, Int, UInt32
 
 from extrags.cameras import Cameras
 from extrags.config import ExploreConfig
@@ -18,6 +19,7 @@ from extrags.exploration.observation import Observation, gaussian_words, observe
 from extrags.exploration.seen import ErrorValue, PairValue, Seen, Value, restored
 from extrags.freespace import FREE, FreeSpace
 from extrags.scene import Scene
+from extrags.shown_pixels import chosen_masks, shown_pixels
 from extrags.store.storable import Storable
 from extrags.zarr_io import has_array, new_group, open_group, read_array, write_array
 
@@ -150,7 +152,12 @@ def frontier_of(scene: Scene, freespace: FreeSpace, config: ExploreConfig) -> Fr
 
 
 def measure_scene(
-    scene: Scene, cameras: Cameras, freespace: FreeSpace, config: ExploreConfig, frontier: Frontier
+    scene: Scene,
+    cameras: Cameras,
+    freespace: FreeSpace,
+    config: ExploreConfig,
+    frontier: Frontier,
+    masks: Sequence[Bool[np.ndarray, "h w"]] | None = None,
 ) -> SceneMeasurements:
     """Measure what all branches need: every training view and every probe is rendered once.
 
@@ -160,16 +167,23 @@ def measure_scene(
         freespace: where cameras may go.
         config: settings.
         frontier: from `frontier_of`.
+        masks: pixels of each training view that show tissue, at the size of `cameras`; None: all. By the
+            frustum (`explore.visibility`) none are looked at.
 
     Raises:
         CaptureError: when there is no training view, or none sees a surface.
+        ShapeError: for masks of other views.
     """
     if len(cameras) == 0:
         raise CaptureError("there is no training view to explore from")
     spread = np.unique(np.linspace(0, len(cameras) - 1, min(len(cameras), config.max_training_views)).round())
-    small = cameras[spread.astype(np.int64)].at_most_width(config.render_width)
+    spread = spread.astype(np.int64)
+    small = cameras[spread].at_most_width(config.render_width)
+    shown = None
+    if config.visibility == "blending":
+        shown = shown_pixels(chosen_masks(masks, cameras, spread), cameras[spread], small)
     n, rows = len(scene.gaussians), len(scene.gaussians) + len(frontier)
-    views = observe(scene, small, frontier, config, depth_unit_mm=None)
+    views = observe(scene, small, frontier, config, depth_unit_mm=None, shown=shown)
     depth_mm = np.concatenate([view.depth_mm for view in views])
     if depth_mm.size == 0:
         raise CaptureError(f"none of the {len(cameras)} training views sees a surface of the scene")

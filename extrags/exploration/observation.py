@@ -60,6 +60,7 @@ def observe(
     config: ExploreConfig,
     *,
     depth_unit_mm: float | None,
+    shown: Bool[np.ndarray, "c h w"] | None = None,
 ) -> list[Observation]:
     """Render views in batches and measure them.
 
@@ -70,30 +71,42 @@ def observe(
         config: what a view must not be.
         depth_unit_mm: median rendered depth of the training views; None for these themselves: then no view
             is too near.
+        shown: pixels of training views that show tissue: what lies beyond the edge of a scope's picture was
+            not seen. None: all.
     """
     found: list[Observation] = []
     for start in range(0, len(cameras), VIEWS_PER_BATCH):
-        found += _observed(scene, cameras[start : start + VIEWS_PER_BATCH], frontier, config, depth_unit_mm)
+        part = slice(start, start + VIEWS_PER_BATCH)
+        inside = None if shown is None else shown[part]
+        found += _observed(scene, cameras[part], frontier, config, depth_unit_mm, inside)
     return found
 
 
 def _observed(
-    scene: Scene, cameras: Cameras, frontier: Frontier, config: ExploreConfig, depth_unit_mm: float | None
+    scene: Scene,
+    cameras: Cameras,
+    frontier: Frontier,
+    config: ExploreConfig,
+    depth_unit_mm: float | None,
+    shown: Bool[np.ndarray, "c h w"] | None,
 ) -> list[Observation]:
+    counted = None if shown is None else torch.from_numpy(shown)
     with torch.no_grad():
         # The diffuse colour is all the search looks at, and saves the harmonics of every Gaussian and view.
-        rendering = scene.render(cameras, visibility=True, sh_degree=0)
+        rendering = scene.render(cameras, visibility=True, visibility_mask=counted, sh_degree=0)
     assert rendering.visibility_max is not None
     if config.visibility == "blending":
         visible = (rendering.visibility_max > config.visible_weight).numpy()
     else:
         visible = rendering.visible.numpy()
-    sizes = sizes_in(rendering, cameras, frontier)
     alpha, depth, rgb = rendering.alpha.numpy(), rendering.depth.numpy(), rendering.rgb.numpy()
+    inside = np.ones(alpha.shape, dtype=bool) if shown is None else shown
+    holes = (alpha < HOLE_ALPHA) & inside
+    sizes = sizes_in(rendering, cameras, frontier, holes)
     margin_mm = 0.0 if depth_unit_mm is None else config.safety_share * depth_unit_mm
     found = []
     for index in range(len(cameras)):
-        surface = (alpha[index] >= HOLE_ALPHA) & (depth[index] > 0)
+        surface = inside[index] & (alpha[index] >= HOLE_ALPHA) & (depth[index] > 0)
         seen_mm = depth[index][surface]
         # A view of no surface at all shows nothing that a restorer could continue.
         rejected = bool(
@@ -109,7 +122,7 @@ def _observed(
                 pose=cameras.world_from_camera[index],
                 visible=np.flatnonzero(visible[index]).astype(np.int32),
                 sizes=sizes[index],
-                holes=alpha[index] < HOLE_ALPHA,
+                holes=holes[index],
                 depth_mm=seen_mm,
                 look_at_mm=_look_at_distance(depth[index], surface, depth_unit_mm),
                 dark=dark,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
@@ -242,6 +243,8 @@ def prepare_search(
     freespace: FreeSpace,
     config: ExploreConfig,
     measured: SceneMeasurements | None = None,
+    *,
+    masks: Sequence[Bool[np.ndarray, "h w"]] | None = None,
 ) -> SearchContext:
     """Collect the inputs that all branches share.
 
@@ -251,6 +254,8 @@ def prepare_search(
         freespace: where cameras may go.
         config: settings.
         measured: from an earlier call with the same inputs (`SearchContext.measured`); None measures now.
+        masks: pixels of each training view that show tissue (`EndoscopicSequence.training_masks`), at the
+            size of `cameras`; None: all. Not looked at where `measured` is given.
 
     Raises:
         CaptureError: when there is no training view, or none sees a surface.
@@ -259,7 +264,7 @@ def prepare_search(
     scene = scene.detached().to("cpu")
     frontier = frontier_of(scene, freespace, config)
     if measured is None:
-        measured = measure_scene(scene, cameras, freespace, config, frontier)
+        measured = measure_scene(scene, cameras, freespace, config, frontier, masks)
     return SearchContext(scene, freespace, measured, config, frontier)
 
 

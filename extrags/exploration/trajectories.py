@@ -288,9 +288,10 @@ def explore(
     """
     config = PROFILES[DEFAULT_PROFILE].explore if config is None else config
     cameras = sequence.training_cameras
+    masks = sequence.training_masks
     if freespace is None:
-        freespace = carve(scene, fuse_surface(scene, cameras), cameras)
-    context = prepare_search(scene, cameras, freespace, config)
+        freespace = carve(scene, fuse_surface(scene, cameras, masks=masks), cameras, masks=masks)
+    context = prepare_search(scene, cameras, freespace, config, masks=masks)
     state = start_exploration(context)
     while anchors := state.next_wave():
         branches = list(map(partial(grow, context, state.known), anchors))

@@ -13,6 +13,7 @@ from extrags.cameras import Cameras, project_points, transform_points
 from extrags.errors import CaptureError
 from extrags.events import Progress, emit
 from extrags.scene import Scene
+from extrags.shown_pixels import chosen_masks, shown_pixels
 from extrags.surface import Mesh
 
 __all__ = ["ColoredMesh", "colored_mesh"]
@@ -57,7 +58,13 @@ class ColoredMesh:
 
 
 def colored_mesh(
-    mesh: Mesh, scene: Scene, train: Cameras, virtual: Cameras | None = None, *, texture: bool = True
+    mesh: Mesh,
+    scene: Scene,
+    train: Cameras,
+    virtual: Cameras | None = None,
+    *,
+    masks: Sequence[Bool[np.ndarray, "h w"]] | None = None,
+    texture: bool = True,
 ) -> ColoredMesh:
     """Colour a mesh from renderings of a scene, and mark what no training view has seen.
 
@@ -72,6 +79,8 @@ def colored_mesh(
         train: the training views.
         virtual: further views, which colour what training views do not see; of any size, with or without a
             lens.
+        masks: pixels of the training views that show tissue (`EndoscopicSequence.training_masks`): beyond
+            the edge of a scope's picture they see nothing. None: all.
         texture: make an image of the surface as well, not only colours of vertices.
 
     Raises:
@@ -95,7 +104,7 @@ def colored_mesh(
     slack = _SEEN_EDGES * float(np.median(np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)))
     training = np.zeros(len(vertices), dtype=bool)
     # Vertices and texels are coloured together: every view is rendered once.
-    for index, view in enumerate(_rendered(scene, parts)):
+    for index, view in enumerate(_rendered(scene, parts, masks)):
         shown = on_vertices.add(view, slack)
         if index < len(train):
             training |= shown
@@ -202,16 +211,21 @@ class _View:
     alpha: Float[np.ndarray, "h w"]
 
 
-def _rendered(scene: Scene, parts: Sequence[Cameras]) -> Iterator[_View]:
+def _rendered(
+    scene: Scene, parts: Sequence[Cameras], masks: Sequence[Bool[np.ndarray, "h w"]] | None
+) -> Iterator[_View]:
+    """The views of all parts; those of the first show nothing outside of their masks."""
     # The median depth comes from the native kernels.
     scene = scene.to("cpu")
     done, total = 0, sum(map(len, parts))
-    for views in parts:
+    for views, shown in zip(parts, (masks, None), strict=False):
         for begun in range(0, len(views), _VIEWS_PER_BATCH):
             batch = views[begun : begun + _VIEWS_PER_BATCH]
             with torch.no_grad():
                 rendering = scene.render(batch, median_depth=True)
-            depths, alphas = np.asarray(rendering.median_depth), rendering.alpha.numpy()
+            inside = chosen_masks(shown, views, range(begun, begun + len(batch)))
+            depths = np.asarray(rendering.median_depth)
+            alphas = np.where(shown_pixels(inside, batch, batch), rendering.alpha.numpy(), 0)
             for index, image in enumerate(rendering.rgb.numpy()):
                 yield _View(batch[index], image, depths[index], alphas[index])
             done += len(batch)

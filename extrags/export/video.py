@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from fractions import Fraction
 from pathlib import Path
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from extrags.cameras import Cameras
@@ -19,6 +19,7 @@ from extrags.events import Progress, emit
 from extrags.exploration.coverage import direction_counts, training_coverage
 from extrags.output_files import whole_file
 from extrags.scene import Scene
+from extrags.shown_pixels import shown_pixels
 
 if TYPE_CHECKING:
     from av.container import OutputContainer
@@ -33,19 +34,24 @@ _QUALITY = "18"
 """Constant rate factor of H.264: 18 is visually lossless, 0 lossless."""
 
 
-def unobserved(scene: Scene, train: Cameras) -> Float[Tensor, "n"]:
+def unobserved(
+    scene: Scene, train: Cameras, masks: Sequence[Bool[np.ndarray, "h w"]] | None = None
+) -> Float[Tensor, "n"]:
     """How little the training views say of each Gaussian: 1 seen by none, 0 from three directions or more.
 
     Args:
         scene: the scene.
         train: the training views.
+        masks: their pixels that show tissue (`EndoscopicSequence.training_masks`); None: all.
     """
+    views = train.at_most_width(160)
     # Coverage is counted on the processor.
     covered = training_coverage(
         scene.to("cpu"),
-        train.at_most_width(160),
+        views,
         visible_weight=_VISIBLE_WEIGHT,
         n_directions=_DIRECTIONS,
+        mask=shown_pixels(masks, train, views),
     )
     known = np.minimum(direction_counts(covered), _ENOUGH_DIRECTIONS) / _ENOUGH_DIRECTIONS
     return torch.from_numpy((1 - known).astype(np.float32))
@@ -57,6 +63,7 @@ def fly_through(
     *,
     exposure: float = 1.0,
     train: Cameras | None = None,
+    masks: Sequence[Bool[np.ndarray, "h w"]] | None = None,
     colors: bool = True,
 ) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
     """Render every camera of a path, one picture beside the other.
@@ -68,6 +75,7 @@ def fly_through(
         train: with the training views, one more column: where the last scene rests on few of them. The
             share of a pixel that falls on Gaussians they hardly saw, or on none at all, from black (well
             known) over red to yellow (unknown).
+        masks: pixels of the training views that show tissue; None: all.
         colors: False shows that column alone.
 
     Yields:
@@ -78,7 +86,7 @@ def fly_through(
     """
     if not scenes or (train is None and not colors):
         raise ConfigError("a fly-through needs at least one scene, and something of it to show")
-    lacking = None if train is None else unobserved(scenes[-1], train)
+    lacking = None if train is None else unobserved(scenes[-1], train, masks)
     gain = torch.tensor([float(exposure)])
     for index in range(len(path)):
         camera = path[index]

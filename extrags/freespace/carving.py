@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -16,6 +17,7 @@ from extrags.freespace.passages import ball_mask, mark, reachable
 from extrags.freespace.visibility import ViewDepths, seen_through
 from extrags.freespace.walls import voxels_of_triangles
 from extrags.scene import Scene
+from extrags.shown_pixels import chosen_masks
 from extrags.surface import Mesh
 from extrags.threads import one_torch_thread
 
@@ -39,6 +41,7 @@ def carve(
     config: FreespaceConfig | None = None,
     *,
     surface_error_mm: Float[np.ndarray, "v"] | None = None,
+    masks: Sequence[Bool[np.ndarray, "h w"]] | None = None,
 ) -> FreeSpace:
     """Occupancy and clearance by space carving with rendered transmittance.
 
@@ -56,12 +59,15 @@ def carve(
         config: settings; None takes those of the profile `balanced`.
         surface_error_mm: expected distance of each vertex from the true surface, by which clearance is
             reduced (`extrags.surface_error`); None for a surface from measured depth.
+        masks: pixels of each view that show tissue (`EndoscopicSequence.training_masks`), at the size of
+            `cameras`: beyond the edge of a scope's picture no view looks through anything. None: all.
 
     Returns:
         The grid, aligned with the principal axes of mesh and cameras.
 
     Raises:
         CaptureError: when no voxel is free, or there is no view to carve from.
+        ShapeError: for masks of other views.
         PoseError: for poses or intrinsics that are not finite.
 
     Source: [ExtraGS, section "Scene Initialization and Feasible Region Estimation"], see docs/references.md.
@@ -82,7 +88,8 @@ def carve(
 
     corners = to_grid(mesh.vertices.astype(np.float64), origin_mm, axes, voxel_mm)
     surface = voxels_of_triangles(corners[mesh.triangles], size)
-    views = ViewDepths.rendered(scene, carving_views(scene, cameras, config), config)
+    carving = carving_views(scene, cameras, config, masks)
+    views = ViewDepths.rendered(scene, cameras[carving], config, chosen_masks(masks, cameras, carving))
     free = seen_through(scene, views, origin_mm, axes, voxel_mm, within & ~surface, config)
     at_cameras, lens = _around_cameras(to_grid(cameras.centers, origin_mm, axes, voxel_mm), surface)
     free |= lens
@@ -110,8 +117,13 @@ def carve(
     return space
 
 
-def carving_views(scene: Scene, cameras: Cameras, config: FreespaceConfig) -> Cameras:
-    """The views that carve: all, or the `max_views` that differ most by place and direction.
+def carving_views(
+    scene: Scene,
+    cameras: Cameras,
+    config: FreespaceConfig,
+    masks: Sequence[Bool[np.ndarray, "h w"]] | None = None,
+) -> Int[np.ndarray, "m"]:
+    """Which views carve: all, or the `max_views` that differ most by place and direction, in their order.
 
     Farthest point sampling from the view nearest to the middle of all, by `extrags.cameras.pose_distances`
     in units of the depth that eight views spread over the recording see.
@@ -119,9 +131,9 @@ def carving_views(scene: Scene, cameras: Cameras, config: FreespaceConfig) -> Ca
     Source: [Gonzalez1985], see docs/references.md.
     """
     if len(cameras) <= config.max_views:
-        return cameras
-    some = cameras[np.linspace(0, len(cameras) - 1, VIEWS_FOR_THE_UNIT).round().astype(np.int64)]
-    unit_mm = ViewDepths.rendered(scene, some, config).unit_mm
+        return np.arange(len(cameras))
+    some = np.linspace(0, len(cameras) - 1, VIEWS_FOR_THE_UNIT).round().astype(np.int64)
+    unit_mm = ViewDepths.rendered(scene, cameras[some], config, chosen_masks(masks, cameras, some)).unit_mm
     if unit_mm <= 0:
         raise CaptureError(f"none of {len(some)} views spread over the recording sees a surface")
     chosen = [int(np.argmin(np.linalg.norm(cameras.centers - cameras.centers.mean(axis=0), axis=1)))]
@@ -130,7 +142,7 @@ def carving_views(scene: Scene, cameras: Cameras, config: FreespaceConfig) -> Ca
         nearest = np.minimum(nearest, pose_distances(cameras, cameras[chosen[-1]], unit_mm)[:, 0])
         nearest[chosen] = -1.0
         chosen.append(int(np.argmax(nearest)))
-    return cameras[np.sort(chosen)]
+    return np.sort(chosen)
 
 
 def _around_cameras(

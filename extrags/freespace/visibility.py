@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import cast
 
@@ -16,6 +16,7 @@ from extrags.events import Progress, emit
 from extrags.freespace.grid import rotated
 from extrags.radial_lens import WIDE_FIELD_DEG
 from extrags.scene import NEAR, Scene
+from extrags.shown_pixels import shown_pixels
 
 __all__ = ["ViewDepths", "seen_through", "voxel_visibility"]
 
@@ -34,7 +35,7 @@ class ViewDepths:
     Args:
         cameras: the views at the size rendered.
         depth: median depth, infinite where the transmittance stays above one half, -1 where the ray ends on
-            no surface, float32, [C, H, W].
+            no surface and where the view shows no tissue, float32, [C, H, W].
         near: points nearer than this z-depth are not observed: the near plane of the rendering.
     """
 
@@ -43,18 +44,34 @@ class ViewDepths:
     near: float = NEAR
 
     @classmethod
-    def rendered(cls, scene: Scene, cameras: Cameras, config: FreespaceConfig) -> ViewDepths:
-        """Render views at `render_width`, at most; of frames with a lens their wide pinholes."""
-        cameras = cameras.as_pinholes(WIDE_FIELD_DEG).at_most_width(config.render_width)
+    def rendered(
+        cls,
+        scene: Scene,
+        cameras: Cameras,
+        config: FreespaceConfig,
+        masks: Sequence[Bool[np.ndarray, "h w"]] | None = None,
+    ) -> ViewDepths:
+        """Render views at `render_width`, at most; of frames with a lens their wide pinholes.
+
+        Args:
+            scene: the reconstructed scene.
+            cameras: the views.
+            config: `render_width`, `min_alpha`.
+            masks: pixels of each view that show tissue, at the size of `cameras`; None: all.
+        """
+        views = cameras.as_pinholes(WIDE_FIELD_DEG).at_most_width(config.render_width)
+        shown = shown_pixels(masks, cameras, views)
         parts = []
         with torch.no_grad():
-            for start in range(0, len(cameras), VIEWS_PER_BATCH):
-                batch = scene.render(cameras[start : start + VIEWS_PER_BATCH], sh_degree=0, median_depth=True)
+            for start in range(0, len(views), VIEWS_PER_BATCH):
+                part = slice(start, start + VIEWS_PER_BATCH)
+                batch = scene.render(views[part], sh_degree=0, median_depth=True)
                 median = cast("torch.Tensor", batch.median_depth).numpy()
                 depth = np.where(median > 0, median, np.float32(np.inf))
-                parts.append(np.where(batch.alpha.numpy() >= config.min_alpha, depth, np.float32(-1)))
-                emit(Progress("freespace", min(start + VIEWS_PER_BATCH, len(cameras)), len(cameras)))
-        return cls(cameras, np.concatenate(parts).astype(np.float32), scene.near)
+                observed = (batch.alpha.numpy() >= config.min_alpha) & shown[part]
+                parts.append(np.where(observed, depth, np.float32(-1)))
+                emit(Progress("freespace", min(start + VIEWS_PER_BATCH, len(views)), len(views)))
+        return cls(views, np.concatenate(parts).astype(np.float32), scene.near)
 
     @property
     def unit_mm(self) -> float:
@@ -141,7 +158,8 @@ def seen_through(
     undecided &= within
     if undecided.any():
         points = origin_mm + rotated((np.argwhere(undecided) + 0.5) * voxel_mm, axes.T)
-        result[undecided] = voxel_visibility(scene, views.cameras, points, config) >= config.occupied_below
+        visibility = voxel_visibility(scene, views.cameras, points, config, observing=views.depth >= 0)
+        result[undecided] = visibility >= config.occupied_below
     return np.asarray(result & within)
 
 
@@ -232,7 +250,12 @@ def _spread(
 
 
 def voxel_visibility(
-    scene: Scene, cameras: Cameras, points: Float[np.ndarray, "q 3"], config: FreespaceConfig
+    scene: Scene,
+    cameras: Cameras,
+    points: Float[np.ndarray, "q 3"],
+    config: FreespaceConfig,
+    *,
+    observing: Bool[np.ndarray, "c h w"] | None = None,
 ) -> Float[np.ndarray, "q"]:
     """Mean of the `top_views` largest transmittances between each point and the views.
 
@@ -241,6 +264,8 @@ def voxel_visibility(
         cameras: the views.
         points: world positions.
         config: `top_views`, `min_alpha`, `render_width`.
+        observing: pixels, at `render_width`, whose rays end on a surface that the view shows; None: those
+            with `min_alpha`.
 
     Returns:
         A value in [0, 1]; NaN where no view observes the point. With fewer than `top_views` such views the
@@ -258,7 +283,8 @@ def voxel_visibility(
             queries = torch.from_numpy(points[inside].astype(np.float32))
             rendering = scene.render(view, sh_degree=0, query_points=queries)
             transmittance = cast("torch.Tensor", rendering.transmittance)[0].numpy()
-            ends = rendering.alpha[0].numpy()[row, column] >= config.min_alpha
+            seen = rendering.alpha[0].numpy() >= config.min_alpha if observing is None else observing[index]
+            ends = seen[row, column]
             value = np.full(len(points), -1.0, dtype=np.float32)
             value[inside] = np.where(np.isfinite(transmittance) & ends, transmittance, -1.0)
             for rank in range(config.top_views):

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 import threading
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from extrags.cameras import Cameras
@@ -76,14 +77,20 @@ class SceneRenderer:
     Args:
         scene: the scene.
         train: the views it was made from, which the layer `uncertainty` needs.
+        masks: pixels of these views that show tissue; None: all.
         device: a CUDA device renders with gsplat, the processor with the native kernels.
     """
 
     def __init__(
-        self, scene: Scene, *, train: Cameras | None = None, device: torch.device | str = "cpu"
+        self,
+        scene: Scene,
+        *,
+        train: Cameras | None = None,
+        masks: Sequence[Bool[np.ndarray, "h w"]] | None = None,
+        device: torch.device | str = "cpu",
     ) -> None:
         self.scene = scene
-        self.train = train
+        self.train, self.masks = train, masks
         self.device = torch.device(device)
         self._lock = threading.Lock()
         gaussians = scene.gaussians
@@ -191,7 +198,8 @@ class SceneRenderer:
     @cached_property
     def _lacking(self) -> Float[Tensor, "n 3"]:
         assert self.train is not None
-        return unobserved(self.scene, self.train)[:, None].expand(-1, 3).contiguous().to(self.device)
+        lacking = unobserved(self.scene, self.train, self.masks)
+        return lacking[:, None].expand(-1, 3).contiguous().to(self.device)
 
     def _nearness(self, camera: Cameras, rendering: Rendering) -> Float[Tensor, "h w"]:
         # One scale for all pictures: colours that follow each picture's own range flicker while it moves.

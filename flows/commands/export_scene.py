@@ -142,10 +142,13 @@ def _gaussians(given: argparse.Namespace, target: Path) -> str:
 
 
 def _mesh(given: argparse.Namespace, target: Path) -> str:
+    import numpy as np
+
     from extrags.cameras import Cameras
     from extrags.export import colored_mesh, write_mesh
     from extrags.radial_lens import WIDE_FIELD_DEG
     from extrags.scene import Scene
+    from extrags.shown_pixels import shown_pixels
     from extrags.surface import fuse_surface
 
     finished, scene = _chosen(given)
@@ -155,12 +158,16 @@ def _mesh(given: argparse.Namespace, target: Path) -> str:
     flights = finished.virtual() if (given.scene or "final") == "final" and finished.fine_tuned else []
     virtual = Cameras.concatenated(flights) if flights else None
     # Virtual views are pinholes, frames may have a lens; the surface is fused from pinholes.
-    views = Cameras.concatenated([train.as_pinholes(WIDE_FIELD_DEG), *flights])
-    mesh = fuse_surface(scene, views, finished.config.surface)
+    pinholes = train.as_pinholes(WIDE_FIELD_DEG)
+    views = Cameras.concatenated([pinholes, *flights])
+    # Virtual views fill their images.
+    masks = [*shown_pixels(frames.training_masks, train, pinholes)]
+    masks += [np.ones((views.height, views.width), dtype=bool)] * (len(views) - len(masks))
+    mesh = fuse_surface(scene, views, finished.config.surface, masks=masks)
     baked = Scene(_baked(given, finished, scene))
     # PLY has no texture that viewers agree on.
     texture = given.texture is not False and target.suffix.lower() != ".ply"
-    colored = colored_mesh(mesh, baked, train, virtual, texture=texture)
+    colored = colored_mesh(mesh, baked, train, virtual, masks=frames.training_masks, texture=texture)
     written = write_mesh(colored, target, metric=frames.metric)
     beside = f", beside it {' and '.join(file.name for file in written[1:])}" if written[1:] else ""
     return (
@@ -199,9 +206,12 @@ def _video(given: argparse.Namespace, target: Path) -> str:
     shown = [which for which in panels if which != "uncertainty"]
     # What is not known is that of the last scene shown, of the final one where none is.
     scenes = [finished.scene(which) for which in shown or ["final"]]
-    train = finished.frames().training_cameras if "uncertainty" in panels else None
+    frames = finished.frames() if "uncertainty" in panels else None
+    train, masks = (None, None) if frames is None else (frames.training_cameras, frames.training_masks)
     exposure = 1.0 if given.exposure is None else given.exposure
-    pictures = fly_through(scenes, path.cameras, exposure=exposure, train=train, colors=bool(shown))
+    pictures = fly_through(
+        scenes, path.cameras, exposure=exposure, train=train, masks=masks, colors=bool(shown)
+    )
     count = write_video(pictures, target, fps=path.fps)
     names = [*shown, *(["uncertainty"] if train is not None else [])]
     return f"{count} frames of {', '.join(names)}, {count / path.fps:.1f} s, {_megabytes(target)}"

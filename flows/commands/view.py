@@ -13,6 +13,8 @@ from flows.commands.options import Parser, add_method
 from flows.interruption import until_told_to_stop
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from extrags.cameras import Cameras
     from extrags.scene import Scene
     from extrags.stages import StageName
@@ -86,7 +88,7 @@ def view(given: argparse.Namespace) -> int:
     from extrags.raster import native_isa
     from extrags.view import SceneRenderer
 
-    renderer = SceneRenderer(shown.scene, train=shown.train, device=device)
+    renderer = SceneRenderer(shown.scene, train=shown.train, masks=shown.masks, device=device)
     server = ViewServer(
         renderer, title=f"extrags: {shown.name}", host=given.host, port=given.port, width=given.width
     )
@@ -106,6 +108,8 @@ class _Shown(NamedTuple):
     name: str
     scene: Scene
     train: Cameras | None
+    masks: list[np.ndarray] | None = None
+    """Pixels of the training views that show tissue."""
 
 
 def _is_file(given: argparse.Namespace) -> bool:
@@ -146,6 +150,7 @@ def _from_file(given: argparse.Namespace) -> _Shown:
 def _from_store(given: argparse.Namespace) -> _Shown:
     from extrags.scene import Scene
     from extrags.sequence import EndoscopicSequence
+    from extrags.shown_pixels import shown_pixels
     from tasks.progress import observed
 
     if run_config(given).uc_nerf.enabled:
@@ -159,4 +164,7 @@ def _from_store(given: argparse.Namespace) -> _Shown:
     # Where fine-tuning was left out, the coarse scene is the final one.
     scene = run.store.load(Scene, run.refs.get("finetune", coarse) if which == "final" else coarse)
     frames = run.store.load(EndoscopicSequence, run.refs["sequence"])
-    return _Shown(f"{which} scene of {given.sequence}", scene, frames.training_cameras.as_pinholes())
+    train = frames.training_cameras
+    pinholes = train.as_pinholes()
+    masks = list(shown_pixels(frames.training_masks, train, pinholes))
+    return _Shown(f"{which} scene of {given.sequence}", scene, pinholes, masks)

@@ -49,6 +49,26 @@ def test_depth_of_faint_pixels_is_not_fused() -> None:
     assert (depth[alpha > config.min_alpha + 1e-3] > 0).mean() > 0.9
 
 
+def test_nothing_is_fused_that_no_mask_shows() -> None:
+    tube = small_tube()
+    cameras, config = tube.cameras, SurfaceConfig()
+    y, x = np.mgrid[: cameras.height, : cameras.width] + 0.5
+    disc = np.hypot(y - cameras.height / 2, x - cameras.width / 2) < 0.35 * cameras.height
+    masks = [disc] * len(cameras)
+    _, whole = rendered_depth(tube.scene, cameras, config)
+    _, depth = rendered_depth(tube.scene, cameras, config, masks=masks)
+    np.testing.assert_array_equal(depth, np.where(disc, whole, 0))
+    mesh = fuse_surface(tube.scene, cameras, config, masks=masks)
+    pixels, _ = cameras.project(mesh.vertices.astype(np.float64))
+    radius = np.hypot(pixels[..., 0] - cameras.width / 2, pixels[..., 1] - cameras.height / 2)
+    # Of each vertex the view that has it nearest to its middle; a voxel or two beyond the edge.
+    assert np.nanmin(radius, axis=0).max() < 0.35 * cameras.height + 4
+    larger = fuse_surface(tube.scene, cameras, config)
+    assert len(mesh.vertices) < 0.9 * len(larger.vertices)
+    with pytest.raises(ShapeError):
+        fuse_surface(tube.scene, cameras, config, masks=masks[1:])
+
+
 class TestFuseDepth:
     def test_recovers_a_sphere(self):
         cameras, depth = sphere_views()

@@ -99,10 +99,11 @@ def viewer_content(inputs: ReportInputs, largest_bytes: int) -> ViewerContent | 
         share = int(largest_bytes / BASE64_SHARE * len(scene.gaussians) / total)
         quantities = scene_quantities(
             scene,
-            sequence.cameras[sequence.train],
+            sequence.training_cameras,
             inputs.virtual_cameras,
             None if inputs.pseudo is None else inputs.pseudo.uncertainty,
             None if inputs.pseudo is None else inputs.pseudo.expected_error,
+            masks=sequence.training_masks,
         )
         encoded, said = encoded_within(scene.gaussians, quantities, share)
         element = f"viewer-{name}"

@@ -6,14 +6,17 @@ Images are carried to Gaussians with the weights the rasteriser blends them with
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from extrags.cameras import Cameras
 from extrags.report.image_table import evenly_spaced
 from extrags.report.viewer.encoding import Quantity
 from extrags.scene import Scene
+from extrags.shown_pixels import chosen_masks, shown_pixels
 
 __all__ = ["SEEN_WEIGHT", "carried_to_gaussians", "scene_quantities", "training_coverage"]
 
@@ -28,7 +31,9 @@ LEAST_WEIGHT = 0.05
 ERROR_QUANTILE = 0.98
 
 
-def training_coverage(scene: Scene, train: Cameras) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+def training_coverage(
+    scene: Scene, train: Cameras, masks: Sequence[Bool[np.ndarray, "h w"]] | None = None
+) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
     """How many of the training views see each Gaussian, and from how many directions.
 
     Directions are counted that are at least 10 degrees apart, in the order of the views, up to eight.
@@ -36,6 +41,7 @@ def training_coverage(scene: Scene, train: Cameras) -> tuple[Float[np.ndarray, "
     Args:
         scene: the Gaussians.
         train: the training cameras; of more than 60, 60 evenly spaced ones.
+        masks: their pixels that show tissue; None: all.
     """
     means = scene.gaussians.means.detach().numpy()
     n = len(means)
@@ -43,8 +49,10 @@ def training_coverage(scene: Scene, train: Cameras) -> tuple[Float[np.ndarray, "
     kept = np.zeros((n, MOST_DIRECTIONS, 3), dtype=np.float32)
     limit = np.cos(np.radians(DIRECTION_APART_DEG))
     for index in evenly_spaced(len(train), MOST_VIEWS):
+        view = train[int(index)]
+        shown = torch.from_numpy(shown_pixels(chosen_masks(masks, train, [int(index)]), view, view))
         with torch.no_grad():
-            weight = scene.render(train[int(index)], visibility=True).visibility_max
+            weight = scene.render(view, visibility=True, visibility_mask=shown).visibility_max
         if weight is None:
             raise AssertionError("visibility was asked for")
         seen = np.flatnonzero(weight[0].numpy() >= SEEN_WEIGHT)
@@ -89,6 +97,8 @@ def scene_quantities(
     virtual: Cameras | None = None,
     uncertainty: Float[np.ndarray, "v h w"] | None = None,
     expected_error: Float[np.ndarray, "v h w"] | None = None,
+    *,
+    masks: Sequence[Bool[np.ndarray, "h w"]] | None = None,
 ) -> dict[str, Quantity]:
     """The quantities of a scene, as far as its run has what they come from.
 
@@ -98,8 +108,9 @@ def scene_quantities(
         virtual: cameras of the virtual views.
         uncertainty: of their pixels, 0 known, 1 unknown.
         expected_error: of their restored colours.
+        masks: pixels of the training views that show tissue (`EndoscopicSequence.training_masks`); None: all.
     """
-    views, directions = training_coverage(scene.detached(), train)
+    views, directions = training_coverage(scene.detached(), train, masks)
     seen = (views > 0).astype(np.float64)
     found = {
         "observed": Quantity(seen, 0, 1, "Observed or invented", ("no training view sees it", "observed")),

@@ -27,13 +27,15 @@ def explored_cameras(
         config: settings of a run.
         every: neighbours on a trajectory show nearly the same: one of so many is taken, the first among them.
     """
-    mesh = fuse_surface(scene, sequence.training_cameras, config.surface)
+    masks = sequence.training_masks
+    mesh = fuse_surface(scene, sequence.training_cameras, config.surface, masks=masks)
     free = carve(
         scene,
         mesh,
         sequence.training_cameras,
         config.freespace,
         surface_error_mm=surface_error_mm(mesh, sequence),
+        masks=masks,
     )
     trajectories = explore(scene, sequence, config.explore, freespace=free).trajectories
     return [cameras[np.arange(0, len(cameras), every)] for cameras in trajectories]

@@ -156,6 +156,36 @@ class TestMeasureScene:
         assert (ready.measured.known[n:] == 0).all()
         assert ready.measured.removable_error > 0
 
+    def test_what_lies_outside_the_masks_was_not_seen(self):
+        tube, space = small_tube(), small_freespace()
+        cameras = tube.cameras
+        mask = np.zeros((cameras.height, cameras.width), dtype=bool)
+        mask[:, : cameras.width // 2] = True
+        config = error_config(probe_views=24)
+        frontier = frontier_of(tube.scene, space, config)
+        whole, half = (
+            measure_scene(tube.scene, cameras, space, config, frontier, masks)
+            for masks in (None, [mask] * len(cameras))
+        )
+        n = len(tube.scene.gaussians)
+        # Where Gaussians have their centres in none of the left halves, hardly any is known.
+        pixels, _ = cameras.project(tube.scene.gaussians.means.numpy().astype(np.float64))
+        with np.errstate(invalid="ignore"):
+            in_image = cameras.contains(pixels)
+            left = (in_image & (pixels[..., 0] < cameras.width / 2)).any(axis=0)
+        away = in_image.any(axis=0) & ~left & (whole.known[:n] > 0.5)
+        assert away.sum() > 50
+        assert half.known[:n][away].mean() < 0.3 * whole.known[:n][away].mean()
+        assert half.removable_error > 1.2 * whole.removable_error
+        assert np.bitwise_count(half.pairs).sum() < 0.9 * np.bitwise_count(whole.pairs).sum()
+        # A search by the frustum looks at no masks, nor does the depth unit of all pixels change much.
+        frustum = config.model_copy(update={"visibility": "frustum"})
+        plain, masked = (
+            measure_scene(tube.scene, cameras, space, frustum, frontier, masks)
+            for masks in (None, [mask] * len(cameras))
+        )
+        np.testing.assert_array_equal(plain.known, masked.known)
+
     def test_round_trip_on_disk(self, tmp_path):
         for ready in (context(), context(score="pairs")):
             ready.measured.save(tmp_path / ready.config.score)

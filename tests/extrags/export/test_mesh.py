@@ -172,6 +172,20 @@ class TestInvented:
         # Its colours are those of the virtual views, not black.
         assert float(found.colors[found.invented > 0].mean()) > 20
 
+    def test_beyond_the_edge_of_the_picture_everything_is(self, tube: Tube, baked: Scene) -> None:
+        train = tube_cameras(3, start_mm=25.0)
+        mesh = fuse_surface(tube.scene, tube_cameras(10), SurfaceConfig(voxel_share=0.02))
+        mask = np.zeros((train.height, train.width), dtype=bool)
+        mask[:, : train.width // 2] = True
+        whole = colored_mesh(mesh, baked, train, texture=False)
+        half = colored_mesh(mesh, baked, train, masks=[mask] * 3, texture=False)
+        assert (half.invented >= whole.invented).all()
+        pixels, _ = train.project(mesh.vertices.astype(np.float64))
+        with np.errstate(invalid="ignore"):
+            left = (train.contains(pixels) & (pixels[..., 0] < train.width / 2)).any(axis=0)
+        assert float(half.invented[~left].min()) == 1
+        assert (half.invented[left] == whole.invented[left]).mean() > 0.9
+
     def test_training_views_with_a_lens(self, tube: Tube, baked: Scene) -> None:
         """Virtual views have none; what the wider views of the lens have shown is not invented."""
         lens = RadialLens((-0.05, 0.0, 0.0, 0.0), float(np.radians(70)))

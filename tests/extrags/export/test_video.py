@@ -86,6 +86,19 @@ def test_what_training_views_have_not_seen(tube: Tube) -> None:
     assert unknown.mean() > known.mean() + 20
 
 
+def test_beyond_the_edge_of_the_picture_nothing_was_seen(tube: Tube) -> None:
+    train = tube.sequence.training_cameras
+    none = np.zeros((train.height, train.width), dtype=bool)
+    none[:2, :2] = True
+    everything = unobserved(tube.scene, train, [np.ones_like(none)] * len(train))
+    assert torch.equal(everything, unobserved(tube.scene, train))
+    assert float(unobserved(tube.scene, train, [none] * len(train)).mean()) > 0.95
+    path = tube.sequence.cameras[4:5]
+    (masked,) = fly_through([tube.scene], path, train=train, masks=[none] * len(train), colors=False)
+    (known,) = fly_through([tube.scene], path, train=train, colors=False)
+    assert masked.mean() > known.mean() + 20
+
+
 @pytest.mark.usefixtures("without_kernels")
 def test_a_scene_elsewhere(tube: Tube, elsewhere: torch.device) -> None:
     few = Scene(tube.scene.gaussians.subset(torch.arange(0, 4600, 20)), tube.scene.light)

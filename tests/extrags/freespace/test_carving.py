@@ -244,8 +244,23 @@ class TestCarve:
         # Most of the recording lingers in one place.
         cameras = tube.cameras[[0] * 6 + [4, 7]]
         chosen = carving_views(tube.scene, cameras, FreespaceConfig(max_views=3))
-        found = np.unique(chosen.centers, axis=0)
+        found = np.unique(cameras.centers[chosen], axis=0)
         np.testing.assert_array_equal(found, np.unique(tube.cameras.centers[[0, 4, 7]], axis=0))
+
+    def test_what_no_mask_shows_is_not_free(self):
+        """A camera before a wall, whose picture is the left half of its image."""
+        scene, wall = scene_of_points(sheet(16.0, half=20.0, n=80)), sheet_mesh(16.0, 20.0)
+        config = FreespaceConfig(grid_size=32, passage_share=0.0, margin_share=0.2)
+        camera = square_camera()
+        mask = np.zeros((camera.height, camera.width), dtype=bool)
+        mask[:, : camera.width // 2] = True
+        whole = carve(scene, wall, camera, config)
+        half = carve(scene, wall, camera, config, masks=[mask])
+        left, right = (whole.from_grid(whole.to_grid(np.array([x, 0.0, 10.0]))) for x in (-3.0, 3.0))
+        assert whole.lookup(left) == whole.lookup(right) == half.lookup(left) == FREE
+        assert half.lookup(right) == UNKNOWN
+        everything = carve(scene, wall, camera, config, masks=[np.ones_like(mask)])
+        np.testing.assert_array_equal(everything.occupancy, whole.occupancy)
 
     def test_the_largest_error_of_a_voxel_counts(self):
         vertices = np.array([[0.2, 0.5, 0.5], [0.6, 0.5, 0.5], [0.7, 0.5, 0.5], [3.5, 3.5, 3.5]])

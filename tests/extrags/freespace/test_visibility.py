@@ -28,6 +28,33 @@ def test_equals_the_full_evaluation(size: int, top_views: int, threshold: float)
     assert 0.01 < found.mean() < 0.5
 
 
+@pytest.mark.parametrize("threshold", [0.3, 0.5, 0.7])
+def test_equals_the_full_evaluation_inside_masks(threshold: float) -> None:
+    tube, space = small_tube(), small_freespace()
+    config = FreespaceConfig(grid_size=24, occupied_below=threshold, render_width=40)
+    voxel_mm = space.voxel_mm * space.grid_size / 24
+    grid = (space.origin_mm, space.axes, voxel_mm)
+    cameras = tube.cameras
+    y, x = np.mgrid[: cameras.height, : cameras.width] + 0.5
+    disc = np.hypot(y - cameras.height / 2, x - cameras.width / 2) < 0.3 * cameras.width
+    views = ViewDepths.rendered(tube.scene, cameras, config, [disc] * len(cameras))
+    everything = ViewDepths.rendered(tube.scene, cameras, config)
+    found, whole = (
+        seen_through(tube.scene, seen, *grid, np.ones((24,) * 3, bool), config)
+        for seen in (views, everything)
+    )
+    points = voxel_centers(24, *grid)
+    full = voxel_visibility(tube.scene, cameras, points, config, observing=views.depth >= 0)
+    np.testing.assert_array_equal(found.ravel(), full >= threshold)
+    # What is seen in no mask is not seen at all.
+    pixels, _ = cameras.project(points)
+    inside = cameras.contains(pixels)
+    column, row = np.where(inside[..., None], pixels, 0).astype(np.int64).transpose(2, 0, 1)
+    in_a_mask = (inside & disc[row, column]).any(axis=0)
+    assert found.ravel()[~in_a_mask].mean() < 0.02 * whole.mean()
+    assert 0.2 * whole.mean() < found.mean() < 0.95 * whole.mean()
+
+
 def test_decides_only_what_is_asked() -> None:
     tube, space = small_tube(), small_freespace()
     config = FreespaceConfig(grid_size=32, render_width=40)

@@ -44,6 +44,17 @@ def test_views_and_directions() -> None:
     assert hidden.tolist() == [1, 0, 0]
 
 
+def test_beyond_the_edge_of_the_picture_nothing_was_seen() -> None:
+    scene = balls((-1.0, 0.0, 0.0), (1.0, 0.0, 0.0))
+    view = cameras((0.0, 0.0, -5.0))
+    left = int(scene.render(view).means2d[0, :, 0].argmin())
+    mask = np.zeros((32, 32), dtype=bool)
+    mask[:, :16] = True
+    found = scene_quantities(scene, view, masks=[mask])["observed"].values
+    assert found[left] == 1
+    assert found[1 - left] == 0
+
+
 def test_images_are_carried_by_blending_weight() -> None:
     scene = balls((-1.0, 0.0, 0.0), (1.0, 0.0, 0.0), (30.0, 0.0, 0.0))
     view = cameras((0.0, 0.0, -5.0))
