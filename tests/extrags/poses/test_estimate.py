@@ -18,6 +18,8 @@ from extrags.errors import CaptureError, ShapeError
 from extrags.events import Event, Progress, subscribed
 from extrags.metrics.pose import absolute_trajectory_error
 from extrags.poses import PoseEstimate, estimate_poses, registration_report, with_estimated_poses
+from extrags.poses.colmap import MAPPED_STEPS
+from extrags.poses.features import EXTRACTED_STEPS
 from extrags.poses.job import PoseJob, PoseJobResult
 from extrags.sequence import EndoscopicSequence
 from tests.extrags.poses.textured_room import HALF_SIZE_MM, room_sequence, turning_room
@@ -136,6 +138,12 @@ def test_progress_runs_to_its_end(run: Run) -> None:
     assert [step.done for step in steps] == sorted(step.done for step in steps)
     assert steps[-1].done == steps[-1].total
     assert steps[-1].values["registered"] == 8
+    # Seven frames and their 21 pairs make the map; each of the two others is matched with all seven.
+    pairs, held_out_pairs = 21, 14
+    weights = EXTRACTED_STEPS * 9 + pairs + MAPPED_STEPS * 7 + held_out_pairs + 2
+    assert {step.total for step in steps} == {weights}
+    # Held-out pairs are counted while they are matched, not only once all are.
+    assert any(step.done == weights - 2 for step in steps)
 
 
 def test_same_bits_and_nothing_of_held_out_frames_in_the_map(run: Run) -> None:
