@@ -192,7 +192,12 @@ def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig | None = No
         return _by_depth(sequence, config, report)
     raise CaptureError(
         failure_message(
-            sequence.name, report, config.min_registered_share, width=sequence.width, instead=instead
+            sequence.name,
+            report,
+            config.min_registered_share,
+            train=_names(sequence, sequence.train),
+            width=sequence.width,
+            instead=instead,
         )
     )
 
@@ -331,6 +336,7 @@ def _by_depth(
                 sequence.name,
                 failed,
                 config.min_registered_share,
+                train=train,
                 width=sequence.width,
                 instead="Alignment by depth failed as well.",
             )

@@ -156,13 +156,22 @@ def expected_frames(min_share: float, report: dict[str, Any]) -> str:
     return f"at least {min_share:.0%}" + (f" and {MIN_TRAINING_FRAMES} frames" if few and enough else "")
 
 
-def failure_message(name: str, report: dict[str, Any], min_share: float, *, width: int, instead: str) -> str:
+def failure_message(
+    name: str,
+    report: dict[str, Any],
+    min_share: float,
+    *,
+    train: Sequence[str],
+    width: int,
+    instead: str,
+) -> str:
     """Why too few training frames have a pose, and what to do, in sentences.
 
     Args:
         name: of the sequence.
         report: from `colmap_report`.
         min_share: what was expected.
+        train: names of the training frames.
         width: of the frames, in pixels.
         instead: why nothing else steps in, as a sentence.
     """
@@ -177,7 +186,7 @@ def failure_message(name: str, report: dict[str, Any], min_share: float, *, widt
         f"matched points: {_degrees(report['pair_angle_deg'])}, pairs that differ by a turn alone: "
         f"{report['pairs_turn_only']} of {report['pairs_examined']}; frames per model: "
         f"{', '.join(map(str, report['model_sizes'])) or 'none'}.",
-        f"Without a pose: {named_frames(report['unregistered_train'], list(report['frames']))}.",
+        f"Without a pose: {named_frames(report['unregistered_train'], train)}.",
         _advice(report, width),
         instead,
     ]
