@@ -336,7 +336,7 @@ class TestOwnVideo:
     """Poses and depth of a recording that brings neither."""
 
     def test_what_poses_and_depth_took(self) -> None:
-        """Processor time of recorded stages, divided by how much slower that machine was (1.19; the last two
+        """Processor time of recorded stages, divided by how much slower that machine was (1.19; the last four
         1.8, by the depth of such a recording)."""
         quick = profile_config("quick")
         model = packaged_model()
@@ -347,6 +347,8 @@ class TestOwnVideo:
             ("poses", 675, 540, 40, 20, 165.0),
             ("poses", 160, 128, 100, 87, 33.5),
             ("poses", 160, 128, 200, 175, 54.5),
+            ("poses", 160, 128, 400, 350, 150.0),
+            ("poses", 160, 128, 800, 700, 440.0),
         ):
             item = Workload(width * height, frames, train, frames - train, quick, width=width)
             assert model.predict(task, item).seconds == pytest.approx(seconds, rel=0.25), (task, width)
