@@ -418,7 +418,11 @@ def memory_terms(task: str) -> tuple[str, ...]:
     stage = stage_of_task(task)
     if stage is not None and stage.name in ("poses", "depth"):
         # There are no views to restore yet.
-        return tuple(term for term in MEMORY_TERMS if term != "views*restored")
+        terms = [term for term in MEMORY_TERMS if term != "views*restored"]
+        # Frames are matched at a width of their own.
+        return tuple(
+            term.replace("restored", "matched_pixels") if stage.name == "depth" else term for term in terms
+        )
     if not cost_of(task).of_final_scene:
         return MEMORY_TERMS
     measured = EVALUATION_TERMS if stage is not None and stage.name == "evaluate" else ()

@@ -15,6 +15,7 @@ import numpy as np
 
 from extrags.lens import Lens
 from extrags.poses.features import (
+    EXTRACTED_STEPS,
     PAIRS_PER_CALL,
     Told,
     extract,
@@ -38,6 +39,13 @@ POSE_INLIER_SHARE = 0.25
 POSE_MAX_ERROR_PX = 8.0
 
 
+MAPPED_STEPS = 10
+"""Steps of the progress for a frame that is mapped: so many pairs could be matched meanwhile (10 in frames of
+320 pixels, more in smaller ones)."""
+FITTED_STEPS = 2
+"""The same for each mapped frame while a lens model is fitted."""
+USUAL_FITS = 5
+"""Lens models that are fitted where the lens turns out to be a pinhole."""
 LENIENT_POSE_INLIERS = 12
 LENIENT_POSE_SHARE = 0.12
 LENIENT_FIRST_PAIR_INLIERS = 50
@@ -69,7 +77,10 @@ def run_colmap(folder: Path, job: PoseJob) -> PoseJobResult:
     frames = len(job.rgb)
     schedule = {key: job.settings[key] for key in ("exhaustive_below", "sequential_overlap")}
     pairs = training_pairs(job.train, job.recording, **schedule)
-    told = Told(total=frames + len(pairs) + len(job.train) + len(job.test))
+    # Held-out frames are matched against those that got a pose: against no more than there are.
+    held_out_pairs = registration_pairs(job.test, job.train, job.recording, **schedule)
+    map_steps = len(job.train) * (MAPPED_STEPS + job.unknown_lens * USUAL_FITS * FITTED_STEPS)
+    told = Told(total=EXTRACTED_STEPS * frames + len(pairs) + map_steps + len(held_out_pairs) + len(job.test))
     database_path = folder / "database.db"
     images = folder / "images"
     write_images(folder, job)
@@ -84,10 +95,13 @@ def run_colmap(folder: Path, job: PoseJob) -> PoseJobResult:
 
     # The first pair of a model counts once, and further models count images again: told steps are
     # held below what the map is given, and set to it at its end.
-    map_made = told.done + len(job.train)
+    map_made = told.done + map_steps
 
     def mapped() -> None:
-        told.reach(min(told.done + 1, map_made))
+        told.reach(min(told.done + MAPPED_STEPS, map_made))
+
+    def fitted() -> None:
+        told.reach(min(told.done + FITTED_STEPS * len(job.train), map_made))
 
     def make_map(database: Path, options: Any) -> dict[int, Any]:
         models: dict[int, Any] = pycolmap.incremental_mapping(
@@ -109,6 +123,7 @@ def run_colmap(folder: Path, job: PoseJob) -> PoseJobResult:
             make_map,
             options,
             lambda model: read_model(model, np.full((frames, 4, 4), np.nan), {}),
+            fitted,
         )
         best, lens = found.model, found.calibration.lens
         report["calibration"] = found.calibration.to_json()
@@ -235,7 +250,7 @@ def _register_held_out(
         return
     extract(pycolmap, folder, job, job.test, told)
     pairs = registration_pairs(job.test, mapped, job.recording, **schedule)
-    match(pycolmap, folder, pairs, int(job.settings["seed"]), None, lenient=job.lenient)
+    match(pycolmap, folder, pairs, int(job.settings["seed"]), told, lenient=job.lenient)
     with opened(pycolmap, folder / "database.db") as database:
         for frame in job.test.tolist():
             own = database.read_image_with_name(image_name(frame))

@@ -14,6 +14,7 @@ import numpy as np
 
 from extrags.errors import ShapeError
 from extrags.poses.features import (
+    EXTRACTED_STEPS,
     Told,
     extract,
     image_name,
@@ -32,6 +33,8 @@ MAX_EPIPOLAR_ERROR_PX = 2.0
 """Sampson distance above which a match contradicts the known poses."""
 MIN_MATCHES = 4
 """Fewer matches that agree with the poses are chance."""
+TRIANGULATED_STEPS = 2
+"""Steps of the progress, of which a matched pair is one, for triangulating the points of a frame."""
 MIN_TRI_ANGLE_DEG = 1.0
 """Rays nearer to parallel say little about depth."""
 
@@ -60,7 +63,7 @@ def run_triangulation(folder: Path, job: PoseJob) -> PoseJobResult:
     seed = int(job.settings["seed"])
     pycolmap.set_random_seed(seed)
     pairs = _pairs(job, poses)
-    told = Told(total=len(job.train) + len(pairs) + 1)
+    told = Told(total=EXTRACTED_STEPS * len(job.train) + len(pairs) + TRIANGULATED_STEPS * len(job.train))
     database_path = folder / "database.db"
     write_images(folder, job)
     with opened(pycolmap, database_path):

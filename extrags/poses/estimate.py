@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from extrags.cameras import as_rotation
 from extrags.config import DEFAULT_PROFILE, PROFILES, IngestConfig, PosesConfig
@@ -23,6 +23,7 @@ from extrags.poses.registration_report import (
     expected_frames,
     failure_message,
     frames_without_pose,
+    named_frames,
     parallax_warning,
 )
 from extrags.poses.rgbd import align_by_depth
@@ -191,7 +192,12 @@ def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig | None = No
         return _by_depth(sequence, config, report)
     raise CaptureError(
         failure_message(
-            sequence.name, report, config.min_registered_share, width=sequence.width, instead=instead
+            sequence.name,
+            report,
+            config.min_registered_share,
+            train=_names(sequence, sequence.train),
+            width=sequence.width,
+            instead=instead,
         )
     )
 
@@ -315,12 +321,14 @@ def _by_depth(
     if failed is not None:
         report["colmap"] = failed
     if not enough_registered(report, config):
+        train = _names(sequence, sequence.train)
+        blind = [name for name in report["unregistered_train"] if name in set(report["without_depth"])]
         message = (
             f"{sequence.name}: alignment by colour and depth placed {report['registered_train']} of "
             f"{report['n_train']} training frames, expected "
             f"{expected_frames(config.min_registered_share, report)}. "
-            f"Without a pose: {', '.join(report['unregistered_train'])}; of these without depth: "
-            f"{', '.join(report['without_depth']) or 'none'}. Give frames nearer together, or less "
+            f"Without a pose: {named_frames(report['unregistered_train'], train)}; of these without depth: "
+            f"{named_frames(blind, train)}. Give frames nearer together, or less "
             "noisy depth"
         )
         if failed is not None:
@@ -328,6 +336,7 @@ def _by_depth(
                 sequence.name,
                 failed,
                 config.min_registered_share,
+                train=train,
                 width=sequence.width,
                 instead="Alignment by depth failed as well.",
             )
@@ -454,11 +463,18 @@ def _cleaned(found: np.ndarray, registered: np.ndarray) -> np.ndarray:
 
 
 def _warn_of_missing(sequence: EndoscopicSequence, report: dict[str, Any]) -> None:
-    for kind in ("train", "test"):
-        if report[f"unregistered_{kind}"]:
+    for kind, frames in (("training", sequence.train), ("held-out", sequence.test)):
+        missing = report["unregistered_train" if kind == "training" else "unregistered_test"]
+        if missing:
             _LOG.warning(
-                "%s: no pose for %s frames %s",
+                "%s: no pose for %d of %d %s frames: %s",
                 sequence.name,
-                "training" if kind == "train" else "held-out",
-                ", ".join(report[f"unregistered_{kind}"]),
+                len(missing),
+                len(frames),
+                kind,
+                named_frames(missing, _names(sequence, frames)),
             )
+
+
+def _names(sequence: EndoscopicSequence, frames: Int[np.ndarray, "n"]) -> list[str]:
+    return [sequence.frame_name(int(frame)) for frame in frames]

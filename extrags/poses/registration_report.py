@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ __all__ = [
     "expected_frames",
     "failure_message",
     "frames_without_pose",
+    "named_frames",
     "parallax_warning",
     "triangulation_angles_deg",
 ]
@@ -30,7 +32,9 @@ FEW_PARTNERS = 4
 """Fewer verified pairs per frame are too few: only points seen by three views help to register the next."""
 LITTLE_PARALLAX_DEG = 2.0
 NAMED_FRAMES = 12
-"""More frames than this are counted and not named in a sentence; the report names them all."""
+"""More frames, or ranges of them, are counted and not named in a sentence; the report names them all."""
+SHORTEST_RANGE = 3
+"""Frames that follow each other and are named by the first and the last."""
 
 
 def colmap_report(
@@ -152,13 +156,22 @@ def expected_frames(min_share: float, report: dict[str, Any]) -> str:
     return f"at least {min_share:.0%}" + (f" and {MIN_TRAINING_FRAMES} frames" if few and enough else "")
 
 
-def failure_message(name: str, report: dict[str, Any], min_share: float, *, width: int, instead: str) -> str:
+def failure_message(
+    name: str,
+    report: dict[str, Any],
+    min_share: float,
+    *,
+    train: Sequence[str],
+    width: int,
+    instead: str,
+) -> str:
     """Why too few training frames have a pose, and what to do, in sentences.
 
     Args:
         name: of the sequence.
         report: from `colmap_report`.
         min_share: what was expected.
+        train: names of the training frames.
         width: of the frames, in pixels.
         instead: why nothing else steps in, as a sentence.
     """
@@ -173,7 +186,7 @@ def failure_message(name: str, report: dict[str, Any], min_share: float, *, widt
         f"matched points: {_degrees(report['pair_angle_deg'])}, pairs that differ by a turn alone: "
         f"{report['pairs_turn_only']} of {report['pairs_examined']}; frames per model: "
         f"{', '.join(map(str, report['model_sizes'])) or 'none'}.",
-        f"Without a pose: {_named(report['unregistered_train'])}.",
+        f"Without a pose: {named_frames(report['unregistered_train'], train)}.",
         _advice(report, width),
         instead,
     ]
@@ -229,10 +242,35 @@ def _advice(report: dict[str, Any], width: int) -> str:
     )
 
 
-def _named(frames: list[str]) -> str:
-    if len(frames) <= NAMED_FRAMES:
-        return ", ".join(frames) or "none"
-    return f"{', '.join(frames[:NAMED_FRAMES])} and {len(frames) - NAMED_FRAMES} more"
+def named_frames(missing: Sequence[str], among: Sequence[str]) -> str:
+    """Frames in a sentence: those that follow each other as a range, at most `NAMED_FRAMES` names and ranges.
+
+    A stretch of a long recording is what is missing as a rule, and its place is what helps to find out why.
+
+    Args:
+        missing: names, in the order of `among`.
+        among: names of all frames of their kind.
+
+    Returns:
+        For instance `0004, 0120 to 0187 and 5 more`.
+    """
+    place = {name: k for k, name in enumerate(among)}
+    runs: list[list[str]] = []
+    for name in missing:
+        if runs and place[name] == place[runs[-1][-1]] + 1:
+            runs[-1].append(name)
+        else:
+            runs.append([name])
+    words: list[str] = []
+    named = 0
+    for run in runs:
+        parts = [f"{run[0]} to {run[-1]}"] if len(run) >= SHORTEST_RANGE else run
+        if len(words) + len(parts) > NAMED_FRAMES:
+            break
+        words += parts
+        named += len(run)
+    more = len(missing) - named
+    return (", ".join(words) or "none") + (f" and {more} more" if more else "")
 
 
 def _degrees(angle: float) -> str:

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from extrags.lens import LENS_PARAMETERS, Lens
+from extrags.poses.features import read_adjusted
 from extrags.poses.intrinsics_covariance import IntrinsicsCovariance, intrinsics_covariance
 from extrags.poses.job import PoseJobResult
 from extrags.poses.lens_calibration import LensCalibration
@@ -65,6 +66,23 @@ class MappedLens:
 
 
 @dataclass(frozen=True)
+class _Adjusted:
+    """A map after bundle adjustment with a lens model.
+
+    Args:
+        model: COLMAP's.
+        lens: its lens.
+        found: its poses, points and observations.
+        squares: mean squared residual of the observations, in pixels squared.
+    """
+
+    model: Any
+    lens: Lens
+    found: PoseJobResult
+    squares: float
+
+
+@dataclass(frozen=True)
 class _Fit:
     model: Any
     lens: Lens
@@ -84,6 +102,7 @@ def map_with_unknown_lens(
     make_map: Callable[[Path, Any], dict[int, Any]],
     options: Callable[[], Any],
     read_model: Callable[[Any], PoseJobResult],
+    fitted: Callable[[], None],
 ) -> MappedLens:
     """Map frames of one unknown lens.
 
@@ -96,6 +115,7 @@ def map_with_unknown_lens(
         make_map: database and options to COLMAP's models.
         options: fresh options of mapping with fixed intrinsics.
         read_model: poses, points and observations of a model.
+        fitted: called after each lens model that was fitted to a map.
 
     Returns:
         The largest map with the estimated lens, or with the guess where the frames do not determine it.
@@ -129,7 +149,7 @@ def map_with_unknown_lens(
         model, _ = mapped(start, free=free)
         if model is None:
             continue
-        found = _fitted(pycolmap, model, start, read_model)
+        found = _fitted(pycolmap, model, start, read_model, fitted)
         if best is None or _rank(found) > _rank(best):
             best = found
         # Another start helps where this one went astray, not where the motion leaves the lens open.
@@ -145,7 +165,7 @@ def map_with_unknown_lens(
         if model is not None and model.num_reg_images() >= best.model.num_reg_images():
             # Simpler families were ruled out; richer ones tell the uncertainty.
             known = next(k for k, names in enumerate(LENS_MODELS) if best.lens.model in names)
-            again = _fitted(pycolmap, model, best.lens, read_model, LENS_MODELS[known:])
+            again = _fitted(pycolmap, model, best.lens, read_model, fitted, LENS_MODELS[known:])
             # The lens that was held must come out again; else the first answer stands.
             best = best if _why_not(again, settings) else again
     std = {name: best.covariance.std(name) for name in best.free()} | {"f": best.focal_std_px}
@@ -185,6 +205,7 @@ def _fitted(
     model: Any,
     start: Lens,
     read_model: Callable[[Any], PoseJobResult],
+    fitted: Callable[[], None],
     families: tuple[tuple[str, ...], ...] = LENS_MODELS,
 ) -> _Fit:
     """The simplest lens that explains the map, and how far its focal length may be off.
@@ -192,21 +213,32 @@ def _fitted(
     That is taken from the model with one distortion parameter more: which of them are zero is itself only
     estimated, and what a little distortion can pass for, the focal length is uncertain by.
     """
+    before = read_model(model)
     tried = []
     for names in families:
-        adjusted = [_adjusted(pycolmap, model, name, start) for name in names]
-        tried.append(min(adjusted, key=_squares))
+        adjusted = []
+        for name in names:
+            adjusted.append(_adjusted(pycolmap, model, name, start, before, read_model))
+            fitted()
+        tried.append(min(adjusted, key=lambda found: found.squares))
     chosen = 0
     for richer in range(1, len(tried)):
-        if _squares(tried[richer]) < (1 - MIN_GAIN) * _squares(tried[chosen]):
+        if tried[richer].squares < (1 - MIN_GAIN) * tried[chosen].squares:
             chosen = richer
-    covariances = [_covariance(found, start, read_model) for found in tried[chosen : chosen + 2]]
+    covariances = [_covariance(found) for found in tried[chosen : chosen + 2]]
     focal_std_px = max(covariance.std("f") for covariance in covariances)
-    return _Fit(tried[chosen], _lens_of(tried[chosen], start), covariances[0], focal_std_px)
+    return _Fit(tried[chosen].model, tried[chosen].lens, covariances[0], focal_std_px)
 
 
-def _adjusted(pycolmap: Any, model: Any, name: str, start: Lens) -> Any:
-    """A copy of the map after bundle adjustment with another lens model."""
+def _adjusted(
+    pycolmap: Any,
+    model: Any,
+    name: str,
+    start: Lens,
+    before: PoseJobResult,
+    read_model: Callable[[Any], PoseJobResult],
+) -> _Adjusted:
+    """A copy of the map after bundle adjustment with another lens model; `before` is the map as it was."""
     copy = deepcopy(model)
     for camera in copy.cameras.values():
         focal = float(np.sqrt(np.prod([camera.focal_length_x, camera.focal_length_y])))
@@ -221,7 +253,15 @@ def _adjusted(pycolmap: Any, model: Any, name: str, start: Lens) -> Any:
     # COLMAP's 0 goes on to the last of 100 iterations wherever the lens is poorly determined.
     options.ceres.solver_options.function_tolerance = 1e-8
     pycolmap.bundle_adjustment(copy, options)
-    return copy
+    # Bundle adjustment drops points behind their cameras first, where there are any.
+    same = copy.compute_num_observations() == len(before.observed_point)
+    found = (
+        read_adjusted(copy, before)
+        if same and copy.num_points3D() == len(before.points)
+        else read_model(copy)
+    )
+    lens = _lens_of(copy, start)
+    return _Adjusted(copy, lens, found, _mean_square_px(lens, found))
 
 
 def _set_lens(pycolmap: Any, camera: Any, lens: Lens) -> None:
@@ -234,22 +274,20 @@ def _lens_of(model: Any, like: Lens) -> Lens:
     return Lens(camera.model.name, tuple(float(p) for p in camera.params), like.width, like.height)
 
 
-def _squares(model: Any) -> float:
-    """Mean squared residual of a map's observations."""
-    total, count = 0.0, 0
-    for point in model.points3D.values():
-        for element in point.track.elements:
-            image = model.image(element.image_id)
-            projected = image.project_point(point.xyz)
-            if projected is None:
-                continue
-            total += float(((projected - image.point2D(element.point2D_idx).xy) ** 2).sum())
-            count += 1
-    return total / max(1, count)
+def _mean_square_px(lens: Lens, found: PoseJobResult) -> float:
+    """Mean squared residual of the observations of points before their cameras, in pixels squared."""
+    frames, frame = np.unique(found.observed_frame, return_inverse=True)
+    camera_from_world = np.linalg.inv(found.world_from_camera[frames])[frame]
+    points = found.points[found.observed_point]
+    moved = np.einsum("oij,oj->oi", camera_from_world[:, :3, :3], points) + camera_from_world[:, :3, 3]
+    before = moved[:, 2] > 0
+    moved, observed = moved[before], found.observed_px[before]
+    projected = np.stack(lens.project(moved[:, 0] / moved[:, 2], moved[:, 1] / moved[:, 2]), axis=1)
+    return float(((projected - observed) ** 2).sum() / max(1, len(observed)))
 
 
-def _covariance(model: Any, start: Lens, read_model: Callable[[Any], PoseJobResult]) -> IntrinsicsCovariance:
-    lens, found = _lens_of(model, start), read_model(model)
+def _covariance(adjusted: _Adjusted) -> IntrinsicsCovariance:
+    lens, found = adjusted.lens, adjusted.found
     return intrinsics_covariance(
         lens,
         _free(lens.model),

@@ -34,7 +34,15 @@ REGISTRY: tuple[Stage, ...] = (
             StageTask(
                 name="poses",
                 # Of one attempt: whether COLMAP needs a second one is not known before.
-                cost=Cost(terms=("frames*feature_pixels", "pairs*features*features")),
+                cost=Cost(
+                    terms=(
+                        "frames*feature_pixels",
+                        "pairs*features*features",
+                        "pairs",
+                        "train",
+                        "train*train",
+                    )
+                ),
             ),
         ),
     ),

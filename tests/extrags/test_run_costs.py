@@ -336,7 +336,8 @@ class TestOwnVideo:
     """Poses and depth of a recording that brings neither."""
 
     def test_what_poses_and_depth_took(self) -> None:
-        """Processor time of recorded stages, divided by how much slower that machine was (1.19)."""
+        """Processor time of recorded stages, divided by how much slower that machine was (1.19; the last four
+        1.8, by the depth of such a recording)."""
         quick = profile_config("quick")
         model = packaged_model()
         for task, width, height, frames, train, seconds in (
@@ -344,6 +345,10 @@ class TestOwnVideo:
             ("depth", 256, 205, 48, 20, 31.8),
             ("depth", 675, 540, 40, 20, 28.2),
             ("poses", 675, 540, 40, 20, 165.0),
+            ("poses", 160, 128, 100, 87, 33.5),
+            ("poses", 160, 128, 200, 175, 54.5),
+            ("poses", 160, 128, 400, 350, 150.0),
+            ("poses", 160, 128, 800, 700, 440.0),
         ):
             item = Workload(width * height, frames, train, frames - train, quick, width=width)
             assert model.predict(task, item).seconds == pytest.approx(seconds, rel=0.25), (task, width)
@@ -370,6 +375,20 @@ class TestOwnVideo:
         assert beyond_the_fit("depth", quick) == ()
         assert beyond_the_fit("depth", quick.with_overrides({"depth.monocular": "network"}))
         assert beyond_the_fit("poses", quick.with_overrides({"poses.fallback": "rgbd"}))
+
+    def test_depth_takes_the_memory_of_frames_as_they_are_matched(self) -> None:
+        """At `depth.max_width`: wider frames are not in memory at their size, and take no more time."""
+        quick = profile_config("quick")
+        small, large = (
+            packaged_model().predict("depth", Workload(w * h, 100, 87, 13, quick, width=w))
+            for w, h in ((256, 205), (1024, 820))
+        )
+        assert small.peak_mib is not None
+        assert large.peak_mib == pytest.approx(small.peak_mib, rel=0.1)
+        assert large.seconds == pytest.approx(small.seconds)
+        # 87 of 100 frames of 320 x 256 px took 1,598 MiB.
+        seen = packaged_model().predict("depth", Workload(320 * 256, 100, 87, 13, quick, width=320))
+        assert seen.peak_mib == pytest.approx(1598, rel=0.25)
 
     @pytest.mark.parametrize("task", ["poses", "depth"])
     def test_neither_takes_memory_for_virtual_views(self, task: str) -> None:

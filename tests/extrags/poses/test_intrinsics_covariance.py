@@ -12,7 +12,13 @@ import pytest
 from extrags.cameras import look_at
 from extrags.errors import ShapeError
 from extrags.lens import Lens
-from extrags.poses.intrinsics_covariance import IntrinsicsCovariance, intrinsics_covariance
+from extrags.poses.features import read_adjusted, read_model
+from extrags.poses.intrinsics_covariance import (
+    IntrinsicsCovariance,
+    _last_rows_of_inverse,
+    intrinsics_covariance,
+)
+from extrags.poses.self_calibration import _mean_square_px
 
 WIDTH, HEIGHT, NOISE_PX = 320, 240, 0.5
 LENS = Lens("SIMPLE_RADIAL", (200.0, 160.0, 120.0, -0.1), WIDTH, HEIGHT)
@@ -174,3 +180,46 @@ def test_too_few_observations_bound_nothing(bundle: Bundle) -> None:
         intrinsics_covariance(
             LENS, (), bundle.poses, bundle.points, bundle.frame, bundle.point, bundle.observed_px
         )
+
+
+def test_the_last_rows_are_those_of_the_inverse() -> None:
+    rng = np.random.default_rng(3)
+    root = rng.normal(size=(40, 60))
+    matrix = root @ root.T
+    scale = np.sqrt(np.diag(matrix))
+    matrix /= scale[:, None] * scale
+    expected = np.linalg.inv(matrix)[-2:]
+    found = _last_rows_of_inverse(matrix.copy(), 2)
+    assert found is not None
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
+    # The same bits each time, although the smallest eigenvalue is found by iteration.
+    np.testing.assert_array_equal(_last_rows_of_inverse(matrix.copy(), 2), found)
+
+
+@pytest.mark.parametrize("smallest", [0.0, 1e-15])
+def test_a_singular_matrix_has_no_inverse(smallest: float) -> None:
+    turn, _ = np.linalg.qr(np.random.default_rng(4).normal(size=(6, 6)))
+    matrix = (turn * np.array([smallest, 1, 1, 1, 1, 1])) @ turn.T
+    assert _last_rows_of_inverse((matrix + matrix.T) / 2, 2) is None
+
+
+def test_a_model_is_read_again_after_bundle_adjustment(bundle: Bundle) -> None:
+    """Only what has moved is read; the mean square of its residuals is COLMAP's."""
+    poses = np.full((len(bundle.poses), 4, 4), np.nan)
+    model = bundle.reconstruction(bundle.observed_px)
+    before = read_model(model, poses.copy(), {})
+    np.testing.assert_array_equal(before.world_from_camera.round(9), bundle.poses.round(9))
+    model, _, _ = adjusted(model)
+    expected, found = read_model(model, poses.copy(), {}), read_adjusted(model, before)
+    for name in ("world_from_camera", "points", "observed_frame", "observed_point", "observed_px"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+    assert np.abs(found.points - before.points).max() > 1e-3
+    squares = [
+        float(((image.project_point(point.xyz) - image.point2D(element.point2D_idx).xy) ** 2).sum())
+        for point in model.points3D.values()
+        for element in point.track.elements
+        for image in [model.image(element.image_id)]
+    ]
+    parameters = tuple(float(value) for value in model.camera(1).params)
+    lens = Lens(LENS.model, parameters, WIDTH, HEIGHT)
+    assert _mean_square_px(lens, found) == pytest.approx(np.mean(squares), rel=1e-9)

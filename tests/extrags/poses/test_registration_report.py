@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from extrags.poses import errors_against_given
-from extrags.poses.registration_report import parallax_warning
+from extrags.poses.registration_report import NAMED_FRAMES, named_frames, parallax_warning
 from extrags.sequence import EndoscopicSequence, Split
 
 FRAMES = 8
@@ -67,3 +67,27 @@ def test_a_map_without_parallax_is_told(angle: float, warned: bool) -> None:
     assert (told is not None) == warned
     if told is not None:
         assert f"differ by {angle:.1f} degrees (median), where 2 or more tell its distance" in told
+
+
+class TestNamedFrames:
+    """A stretch of a long recording is missing as a rule; its place tells more than hundreds of names."""
+
+    NAMES = tuple(f"{k:04d}" for k in range(800))
+
+    def test_frames_that_follow_each_other_are_a_range(self) -> None:
+        missing = [*self.NAMES[3:5], *self.NAMES[120:188], self.NAMES[300]]
+        assert named_frames(missing, self.NAMES) == "0003, 0004, 0120 to 0187, 0300"
+
+    def test_neighbours_are_those_of_their_own_kind(self) -> None:
+        """Between training frames held-out ones have been left out."""
+        training = [name for name in self.NAMES if int(name) % 8]
+        assert named_frames(training[5:20], training) == "0006 to 0022"
+
+    def test_many_are_counted(self) -> None:
+        scattered = self.NAMES[::4]
+        said = named_frames(scattered, self.NAMES)
+        assert said.count(", ") == NAMED_FRAMES - 1
+        assert said.endswith(f"0044 and {len(scattered) - NAMED_FRAMES} more")
+
+    def test_none(self) -> None:
+        assert named_frames([], self.NAMES) == "none"

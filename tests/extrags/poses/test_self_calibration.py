@@ -12,8 +12,10 @@ import pytest
 from extrags.cameras import Cameras, look_at
 from extrags.config import IngestConfig, PosesConfig
 from extrags.errors import ConfigError, ShapeError
+from extrags.events import Event, Progress, subscribed
 from extrags.lens import Lens
 from extrags.poses import LensCalibration, estimate_poses, with_calibration, with_estimated_poses
+from extrags.poses.colmap import FITTED_STEPS, USUAL_FITS
 from extrags.poses.estimate import PoseEstimate
 from extrags.sequence import EndoscopicSequence, Split
 from tests.extrags.poses.textured_room import render_room, room_sequence, turning_room
@@ -73,6 +75,17 @@ class TestFocalLength:
         assert 0 < calibration.focal_std_px < 0.04 * TRUE_FOCAL_PX
         assert abs(calibration.focal_px - TRUE_FOCAL_PX) < 4 * calibration.focal_std_px
         assert found.registered.all()
+
+    def test_progress_goes_on_while_lenses_are_fitted(self, room: EndoscopicSequence) -> None:
+        """On long recordings that takes minutes, in which nothing else would be heard."""
+        events: list[Event] = []
+        with subscribed(events.append):
+            estimate_poses(guessed(room), CONFIG)
+        steps = [event for event in events if isinstance(event, Progress)]
+        fit = FITTED_STEPS * len(room.train)
+        jumps = np.diff([step.done for step in steps])
+        assert (jumps == fit).sum() >= USUAL_FITS - 1
+        assert jumps.max() <= max(fit, 8 * 16, 100)
 
     def test_it_is_said(self, found: PoseEstimate, room: EndoscopicSequence) -> None:
         assert found.summary.endswith("), estimated")
