@@ -38,7 +38,6 @@ MIN_POSE_INLIERS = 12
 POSE_INLIER_SHARE = 0.25
 POSE_MAX_ERROR_PX = 8.0
 
-
 MAPPED_STEPS = 10
 """Steps of the progress for a frame that is mapped: so many pairs could be matched meanwhile (10 in frames of
 320 pixels, more in smaller ones)."""
@@ -46,6 +45,7 @@ FITTED_STEPS = 2
 """The same for each mapped frame while a lens model is fitted."""
 USUAL_FITS = 5
 """Lens models that are fitted where the lens turns out to be a pinhole."""
+
 LENIENT_POSE_INLIERS = 12
 LENIENT_POSE_SHARE = 0.12
 LENIENT_FIRST_PAIR_INLIERS = 50
