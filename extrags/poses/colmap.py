@@ -46,6 +46,10 @@ FITTED_STEPS = 2
 USUAL_FITS = 5
 """Lens models that are fitted where the lens turns out to be a pinhole."""
 
+ADJUSTED_TOLERANCE = 1e-5
+"""Relative decrease of the cost below which a bundle adjustment of the mapping ends. COLMAP's 0 goes on while
+there is any, for fifty iterations at most, although the next frame moves the map again."""
+
 LENIENT_POSE_INLIERS = 12
 LENIENT_POSE_SHARE = 0.12
 LENIENT_FIRST_PAIR_INLIERS = 50
@@ -218,6 +222,7 @@ def _mapping_options(pycolmap: Any, settings: dict[str, Any], *, lenient: bool) 
     options.mapper.abs_pose_refine_focal_length = False
     options.mapper.abs_pose_refine_extra_params = False
     options.mapper.init_min_tri_angle = settings["min_tri_angle_deg"]
+    options.ba_local_function_tolerance = options.ba_global_function_tolerance = ADJUSTED_TOLERANCE
     options.min_model_size = 3
     options.max_num_models = 5
     if lenient:
