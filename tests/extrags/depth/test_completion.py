@@ -151,6 +151,7 @@ def test_bundled_weights_complete_unseen_cavities() -> None:
     assert blind.absrel > found.absrel
 
 
+@pytest.mark.slow
 def test_single_frames_are_told_to_be_as_wrong_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
     """Weights that never practised single frames are .31 off here and expect .12."""
     monkeypatch.setattr(practice, "SINGLE_SHARE", 1.0)
