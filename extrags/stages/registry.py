@@ -34,15 +34,7 @@ REGISTRY: tuple[Stage, ...] = (
             StageTask(
                 name="poses",
                 # Of one attempt: whether COLMAP needs a second one is not known before.
-                cost=Cost(
-                    terms=(
-                        "frames*feature_pixels",
-                        "pairs*features*features",
-                        "pairs",
-                        "train",
-                        "train*train",
-                    )
-                ),
+                cost=Cost(terms=("frames*feature_pixels", "pairs*features*features", "train*train")),
             ),
         ),
     ),
