@@ -336,8 +336,8 @@ class TestOwnVideo:
     """Poses and depth of a recording that brings neither."""
 
     def test_what_poses_and_depth_took(self) -> None:
-        """Processor time of recorded stages, divided by how much slower that machine was (1.19; the last three
-        1.5 and 1.8, by poses and depth of other recordings there)."""
+        """Processor time of recorded stages, divided by how much slower that machine was: 1.19, of the last
+        three 1.5 and 1.8, by poses and depth of other recordings there."""
         quick = profile_config("quick")
         model = packaged_model()
         for task, width, height, frames, train, seconds in (
