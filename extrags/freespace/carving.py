@@ -126,7 +126,7 @@ def carving_views(
     """Which views carve: all, or the `max_views` that differ most by place and direction, in their order.
 
     Farthest point sampling from the view nearest to the middle of all, by `extrags.cameras.pose_distances`
-    in units of the depth that eight views spread over the recording see.
+    in units of the depth that eight views spread over the recording see, inside their masks.
 
     Source: [Gonzalez1985], see docs/references.md.
     """

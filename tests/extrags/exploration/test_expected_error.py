@@ -178,7 +178,7 @@ class TestMeasureScene:
         assert half.known[:n][away].mean() < 0.3 * whole.known[:n][away].mean()
         assert half.removable_error > 1.2 * whole.removable_error
         assert np.bitwise_count(half.pairs).sum() < 0.9 * np.bitwise_count(whole.pairs).sum()
-        # A search by the frustum looks at no masks, nor does the depth unit of all pixels change much.
+        # A search by the frustum looks at no masks.
         frustum = config.model_copy(update={"visibility": "frustum"})
         plain, masked = (
             measure_scene(tube.scene, cameras, space, frustum, frontier, masks)
