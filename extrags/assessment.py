@@ -70,8 +70,8 @@ def measure(
         scene: the coarse reconstruction.
         sequence: its frames.
         settings: the probe views, and what they lack.
-        coverage: when a Gaussian counts as seen from a direction; as in the exploration, which takes all
-            pixels of training views, though. By the frustum no masks are looked at.
+        coverage: when a Gaussian counts as seen from a direction, as in the exploration. By the frustum no
+            masks are looked at.
 
     Returns:
         Measurements by name; shares are of all pixels of the probe views, of the valid ones of the training

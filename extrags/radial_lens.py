@@ -238,7 +238,8 @@ class RadialLens:
             K: of the images taken through this lens.
             width: of the images, in pixels.
             height: of the images, in pixels.
-            field_of_view_deg: horizontal, at most; less where the image shows less.
+            field_of_view_deg: horizontal, at most; less where the image shows less, on the side where it
+                shows the least.
         """
         edge = np.array(min(K[0, 2], width - K[0, 2]) / K[0, 0])
         shown = 2 * min(float(self.angle(edge)), self.max_angle_rad)

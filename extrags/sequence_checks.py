@@ -16,6 +16,7 @@ from extrags.sequence import EndoscopicSequence
 __all__ = [
     "SMALLEST_SIDE_PX",
     "check_arrays",
+    "check_axis_in_image",
     "check_depth",
     "check_image_size",
     "check_intrinsics",
@@ -45,6 +46,8 @@ def check_arrays(sequence: EndoscopicSequence, *, file: object = None) -> None:
     for index in range(len(sequence)):
         name = sequence.frame_name(index)
         check_intrinsics(sequence.K[index], sequence.width, sequence.height, frame=name, file=file)
+        if sequence.lens is not None:
+            check_axis_in_image(sequence.K[index], sequence.width, sequence.height, frame=name, file=file)
         if not sequence.mask[index].any():
             raise SourceError("the mask leaves no pixel", file=file, frame=name, field="mask")
         if sequence.world_from_camera is not None:
@@ -141,6 +144,24 @@ def check_intrinsics(
     for name, center, size in (("cx", K[0, 2], width), ("cy", K[1, 2], height)):
         if not -size < center < 2 * size:
             raise refuse(f"principal point {name} = {center:g} px lies far outside {width} x {height} px")
+
+
+def check_axis_in_image(
+    K: Float[np.ndarray, "3 3"], width: int, height: int, *, frame: object = None, file: object = None
+) -> None:
+    """Refuse original pixels of a lens whose axis they do not show: there is no pinhole about it.
+
+    Raises:
+        SourceError: names the principal point.
+    """
+    if not (0 < K[0, 2] < width and 0 < K[1, 2] < height):
+        raise SourceError(
+            f"the axis of the lens, at ({K[0, 2]:g}, {K[1, 2]:g}) px, lies outside the image of {width} x "
+            f"{height} px; expected it inside",
+            file=file,
+            frame=frame,
+            field="K",
+        )
 
 
 def check_depth(

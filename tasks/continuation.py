@@ -16,7 +16,7 @@ from tasks.stage import stage
 
 __all__ = ["Earlier", "Search", "continued_coarse", "found_whole", "made_before", "nearest_scene"]
 
-CONTINUED_VERSION = 3
+CONTINUED_VERSION = 4
 """Raised for what differs in continuing alone: another reconstruction is another version of it anyway."""
 STAGES = ("coarse", "continued-coarse")
 """Stages whose scenes can be gone on from."""

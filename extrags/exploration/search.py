@@ -259,6 +259,7 @@ def prepare_search(
 
     Raises:
         CaptureError: when there is no training view, or none sees a surface.
+        ShapeError: when there are not as many masks as cameras.
     """
     # What a view sees is told by blending weights, which the native kernels give and gsplat does not.
     scene = scene.detached().to("cpu")

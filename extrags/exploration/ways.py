@@ -22,6 +22,7 @@ from jaxtyping import Bool, Float, Int
 from extrags.cameras import Cameras, rotation_about
 from extrags.config import ExploreConfig
 from extrags.events import Progress, emit
+from extrags.exploration.expected_error import CLEARANCE_ROUNDING
 from extrags.exploration.primitives import apply_primitives, orthonormalised, primitive_motions
 from extrags.exploration.waves import search_starts
 from extrags.freespace import FREE, UNKNOWN, FreeSpace
@@ -121,6 +122,7 @@ class Moves:
         centers = poses[:, :3, 3]
         # A recording may itself go nearer to the wall than the margin.
         needed = min(self.margin_mm, float(self.space.clearance_at(start[None, :3, 3])[0]))
+        needed *= 1 - CLEARANCE_ROUNDING
         return np.asarray(
             (self.space.lookup(centers) == FREE)
             & (self.space.clearance_at(centers) >= needed)

@@ -22,6 +22,7 @@ from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
 
 from extrags.cameras import Cameras
 from extrags.config import SurfaceConfig
@@ -63,7 +64,8 @@ N_SAMPLES = 30_000
 THRESHOLD_MM = 1.0
 """Distance below which a sample counts as correct: about one voxel of the fusion at a distance of 60 mm."""
 THRESHOLD_SHARE = 0.05
-"""The same where lengths are not millimetres, as a share of the median true depth of training frames."""
+"""The same where lengths are not millimetres, as a share of the median true depth of training frames; of all
+frames where these have none; without any, of the median distance of what is seen from the nearest camera."""
 _HIDDEN_SHARE = 0.005
 """Tolerance of the occlusion test, as a share of the distance between camera and point."""
 _SEED = 20_260
@@ -215,7 +217,7 @@ def evaluate_surface(mesh: Mesh | None, truth: TrueSurface, sequence: Endoscopic
         to_truth, nearest = _nearest(found, true_scene)
         found_observed, found_unobserved = _parts(nearest, true_scene, sequence, far)
         to_mesh, _ = distance_to_surface(points, mesh)
-    threshold = _threshold(sequence)
+    threshold = _threshold(sequence, points, observed | unobserved)
     counted = observed | unobserved
     return SurfaceResult(
         observed=_errors(to_truth[found_observed], to_mesh[observed], threshold),
@@ -397,11 +399,22 @@ def _max_fused_depth(sequence: EndoscopicSequence) -> float:
     return float("inf") if found is None else found
 
 
-def _threshold(sequence: EndoscopicSequence) -> float:
-    if sequence.metric or sequence.true_depth_mm is None:
+def _threshold(
+    sequence: EndoscopicSequence, points: Float[np.ndarray, "n 3"], seen: Bool[np.ndarray, "n"]
+) -> float:
+    """Distance below which a sample counts as correct, with true points and which of them cameras see."""
+    if sequence.metric:
         return THRESHOLD_MM
-    found = median_of_frames(_true_depths(sequence, sequence.train))
-    return THRESHOLD_MM if found is None else THRESHOLD_SHARE * found
+    if sequence.true_depth_mm is not None:
+        # Held-out frames alone may have depth.
+        for frames in (sequence.train, _all_frames(sequence)):
+            found = median_of_frames(_true_depths(sequence, frames))
+            if found is not None:
+                return THRESHOLD_SHARE * found
+    # A mesh alone; where no camera sees it, no sample is held against this.
+    centers = sequence.cameras[_all_frames(sequence)].centers
+    away = KDTree(centers).query(points[seen] if seen.any() else points)[0]
+    return THRESHOLD_SHARE * float(np.median(away))
 
 
 def _true_depths(

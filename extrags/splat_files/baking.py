@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from extrags.cameras import Cameras
@@ -14,6 +16,7 @@ from extrags.gaussians import SH_C0, Gaussians
 from extrags.illumination import NearFieldLight
 from extrags.raster.light import shortest_axes
 from extrags.scene import Scene
+from extrags.shown_pixels import chosen_masks, shown_pixels
 
 __all__ = ["bake_light", "bake_recorded_light"]
 
@@ -51,7 +54,13 @@ def bake_light(scene: Scene, *, distance: float | None = None, exposure: float =
     return _lit(gaussians, light, exposure * gain)
 
 
-def bake_recorded_light(scene: Scene, cameras: Cameras, *, exposure: float = 1.0) -> Gaussians:
+def bake_recorded_light(
+    scene: Scene,
+    cameras: Cameras,
+    *,
+    exposure: float = 1.0,
+    masks: Sequence[Bool[np.ndarray, "h w"]] | None = None,
+) -> Gaussians:
     """The Gaussians with the light that fell on them, on average, when these cameras saw them.
 
     The gain of each Gaussian, and what highlights add, are means over the views, weighted by the largest
@@ -63,9 +72,11 @@ def bake_recorded_light(scene: Scene, cameras: Cameras, *, exposure: float = 1.0
         scene: with or without light.
         cameras: the training views.
         exposure: gain of the camera; 1 is the mean of the training frames.
+        masks: pixels of each view that show tissue (`EndoscopicSequence.training_masks`); None: all.
 
     Raises:
         ConfigError: for an exposure that is not positive and finite.
+        ShapeError: when there are not as many masks as cameras, or their sizes differ.
     """
     if scene.light is None:
         return bake_light(scene, exposure=exposure)
@@ -77,13 +88,16 @@ def bake_recorded_light(scene: Scene, cameras: Cameras, *, exposure: float = 1.0
     none = gaussians.means.new_zeros(len(gaussians))
     weight, lit, shine, facing, nearest = none, none, none, none, torch.full_like(none, math.inf)
     for begun in range(0, len(cameras), _VIEWS_PER_BATCH):
-        batch = cameras[begun : begun + _VIEWS_PER_BATCH]
+        index = range(begun, min(begun + _VIEWS_PER_BATCH, len(cameras)))
+        batch = cameras[index.start : index.stop]
+        shown = None if masks is None else shown_pixels(chosen_masks(masks, cameras, index), batch, batch)
+        tissue = None if shown is None else torch.from_numpy(shown)
         with torch.no_grad():
-            seen = scene.render(batch, visibility=True, sh_degree=0).visibility_max
-        for index in range(len(batch)):
-            rotation, shift = viewmats[begun + index, :3, :3], viewmats[begun + index, :3, 3]
+            seen = scene.render(batch, visibility=True, visibility_mask=tissue, sh_degree=0).visibility_max
+        for place, view in enumerate(index):
+            rotation, shift = viewmats[view, :3, :3], viewmats[view, :3, 3]
             points = gaussians.means @ rotation.T + shift
-            share = none if seen is None else seen[index]
+            share = none if seen is None else seen[place]
             turned = normals @ rotation.T
             lit = lit + share * light.gain(points, turned)
             shine = shine + share * light.specular_gain(points, turned)

@@ -36,6 +36,10 @@ _COLOR_SCALE = 0.15
 """Of the colours' SH coefficients, set by the format: 8 bits reach a little beyond [0, 1]."""
 _REST = {0: 0, 1: 3, 2: 8, 3: 15}
 """SH coefficients above degree 0, by degree."""
+_SMALLEST_SCALE, _LARGEST_SCALE = -10.0, 255 / 16 - 10
+"""Logarithms of standard deviations that 8 bits hold."""
+_OUTSIDE_SHARE = 0.01
+"""So many Gaussians may be of another size without a picture showing it much."""
 _LARGEST_COUNT = 10_000_000
 _QUAT_MAX = 511
 _COMPRESSION = 6
@@ -48,8 +52,8 @@ def write_spz(gaussians: Gaussians, path: Path) -> None:
     """Write SPZ of version 3.
 
     Positions get as many fractional bits as the scene's size leaves of 24, at most 20; scales reach from
-    e^-10 to e^5.9 world units, colours from -0.44 to 1.44; SH coefficients lie in [-1, 1), in steps of 1/8
-    (degree 1: 1/16) as the format's own tools round them.
+    e^-10 to e^5.9 world units (a flat Gaussian may be thinner), colours from -0.44 to 1.44; SH coefficients
+    lie in [-1, 1), in steps of 1/8 (degree 1: 1/16) as the format's own tools round them.
 
     Args:
         gaussians: with colours, not albedo (`bake_light`).
@@ -57,7 +61,8 @@ def write_spz(gaussians: Gaussians, path: Path) -> None:
 
     Raises:
         CaptureError: when there are no Gaussians.
-        SourceError: for positions that 24 bits cannot hold.
+        SourceError: for positions that 24 bits cannot hold, or where more than one Gaussian in a hundred has
+            a size that the format has not.
     """
     gaussians, n = gaussians.for_file(path), len(gaussians)
     means = gaussians.means.double().numpy() * [1, -1, -1]
@@ -70,6 +75,7 @@ def write_spz(gaussians: Gaussians, path: Path) -> None:
     opacities = levels(gaussians.opacities.sigmoid().numpy(), 8).astype(np.uint8)
     sh0 = gaussians.sh0.numpy()[:, 0]
     colors = levels(sh0 * _COLOR_SCALE + 0.5, 8).astype(np.uint8)
+    _check_sizes(gaussians.scales.numpy())
     scales = _bytes((gaussians.scales.numpy() + 10) * 16)
     # Components in the format's order x, y, z, w.
     quats = unit_quaternions(gaussians.quats.numpy())[:, [1, 2, 3, 0]] * [1, -1, -1, 1]
@@ -87,6 +93,20 @@ def write_spz(gaussians: Gaussians, path: Path) -> None:
     body = b"".join(np.ascontiguousarray(part).tobytes() for part in content)
     # No time stamp: the same scene gives the same file.
     write_file(path, gzip.compress(header + body, _COMPRESSION, mtime=0))
+
+
+def _check_sizes(scales: Float[np.ndarray, "n 3"]) -> None:
+    """Refuse a scene of which much would get another size; scales are logarithms."""
+    # How thin the thinnest axis is changes no picture.
+    _, middle, largest = np.sort(scales, axis=1).T
+    for outside, kind in ((largest > _LARGEST_SCALE, "larger"), (middle < _SMALLEST_SCALE, "smaller")):
+        if outside.mean() > _OUTSIDE_SHARE:
+            raise SourceError(
+                f"{100 * outside.mean():.0f} % of the Gaussians are {kind} than SPZ can hold, whose scales "
+                f"reach from {np.exp(_SMALLEST_SCALE):.1e} to {np.exp(_LARGEST_SCALE):.0f} units of the "
+                "scene; another format, or another unit, holds them",
+                field="scales",
+            )
 
 
 def read_spz(path: Path) -> Gaussians:

@@ -185,14 +185,18 @@ def _with_exposures(light: NearFieldLight, places: Int[np.ndarray, "k"], count: 
 def _strongest(
     scene: Scene, sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"], count: int
 ) -> Int[Tensor, "n"]:
-    """Indices of the Gaussians that show most in the frames, at most `count` of them, in their order."""
+    """Indices of the Gaussians that show most of tissue in the frames, at most `count`, in their order."""
     everyone = len(scene.gaussians)
     if everyone <= count:
         return torch.arange(everyone)
     seen = torch.zeros(everyone)
     for frame in frames:
         with torch.no_grad():
-            shown = scene.render(sequence.cameras[int(frame)], visibility=True).visibility_sum
+            # Beyond the mask, in the dark corners of a round picture, a scene shows what nobody saw.
+            tissue = torch.from_numpy(sequence.mask[[int(frame)]])
+            shown = scene.render(
+                sequence.cameras[int(frame)], visibility=True, visibility_mask=tissue
+            ).visibility_sum
         if shown is None:
             raise ShapeError("the rasteriser returned no visibility")
         seen += shown.sum(dim=0) if shown.ndim > 1 else shown

@@ -30,7 +30,8 @@ __all__ = [
 ]
 
 AGREEMENT = 0.05
-"""Relative depth difference at which the weight of a real view falls to 1/e."""
+"""Relative depth difference at which the weight of a real view has fallen to a third; at 1.73 times that it
+is zero."""
 LATTICE_PX = 8
 """Co-visibility is judged on one pixel in this many, along each axis."""
 DISTANCE_TOLERANCE = 0.2

@@ -119,7 +119,8 @@ def _baked(given: argparse.Namespace, finished: _Finished, scene: Scene) -> Gaus
     exposure = 1.0 if given.exposure is None else given.exposure
     if given.light == "frontal" or scene.light is None:
         return bake_light(scene, distance=given.distance, exposure=exposure)
-    return bake_recorded_light(scene, finished.frames().training_cameras, exposure=exposure)
+    frames = finished.frames()
+    return bake_recorded_light(scene, frames.training_cameras, exposure=exposure, masks=frames.training_masks)
 
 
 def _gaussians(given: argparse.Namespace, target: Path) -> str:

@@ -17,9 +17,10 @@ from extrags.gaussians import Gaussians
 from extrags.in_memory_pipeline import InMemoryPipeline
 from extrags.metrics.image import ssim
 from extrags.metrics.protocol import RenderedViews
+from extrags.radial_lens import RadialLens
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence, Split
-from extrags.sequence_checks import SMALLEST_SIDE_PX
+from extrags.sequence_checks import SMALLEST_SIDE_PX, check_arrays
 
 FRAMES, HEIGHT, WIDTH = 10, 12, 16
 K = np.array([[14.0, 0, 8], [0, 14.0, 6], [0, 0, 1]])
@@ -50,6 +51,19 @@ def test_the_smallest_frames_are_those_that_can_be_evaluated() -> None:
         extrags.sequence_from_arrays(too_small, K)
     with pytest.raises(ShapeError, match="SSIM needs images larger"):
         ssim(torch.zeros(side, side - 1, 3), torch.zeros(side, side - 1, 3))
+
+
+def test_a_lens_has_its_axis_in_the_image() -> None:
+    """There is no pinhole about another."""
+    sequence = replace(
+        extrags.sequence_from_arrays(arrays()["rgb"], K), lens=RadialLens((0.0, 0.0, 0.0, 0.0), 1.0)
+    )
+    check_arrays(sequence)
+    for x, y in ((-1.0, 6.0), (8.0, 12.5)):
+        beside = np.tile(np.array([[14.0, 0, x], [0, 14.0, y], [0, 0, 1]]), (FRAMES, 1, 1))
+        check_arrays(replace(sequence, K=beside, lens=None))
+        with pytest.raises(SourceError, match=r"field K: the axis of the lens, at .* lies outside"):
+            check_arrays(replace(sequence, K=beside))
 
 
 class TestFromArrays:

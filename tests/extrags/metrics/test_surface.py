@@ -245,6 +245,26 @@ class TestObserved:
         small = replace(arbitrary, depth_mm=sequence.depth_mm / 10)
         assert evaluate_surface(WALL, TrueSurface(WALL, "mesh"), small).threshold_mm == pytest.approx(0.1)
 
+    @pytest.mark.parametrize("scale", [0.01, 1.0, 100.0])
+    @pytest.mark.parametrize("known", ["held out", "mesh alone"])
+    def test_it_has_no_unit_where_training_frames_have_no_depth(
+        self, sequence: EndoscopicSequence, known: str, scale: float
+    ) -> None:
+        assert sequence.depth_mm is not None
+        depth = sequence.depth_mm * np.float32(scale)
+        depth[sequence.train] = 0
+        poses = sequence.cameras.world_from_camera.copy()
+        poses[:, :3, 3] *= scale
+        moved = replace(
+            sequence,
+            metric=False,
+            world_from_camera=poses,
+            depth_mm=depth if known == "held out" else None,
+        )
+        wall = Mesh(WALL.vertices * np.float32(scale), WALL.triangles)
+        result = evaluate_surface(wall, TrueSurface(wall, "mesh"), moved)
+        assert result.threshold_mm / scale == pytest.approx(0.05 * WALL_MM, rel=0.1)
+
     def test_no_reconstruction_covers_nothing(self, sequence: EndoscopicSequence) -> None:
         tree = evaluate_surface(None, TrueSurface(WALL, "mesh"), sequence).to_json()
         assert (tree["coverage"], tree["recall"], tree["fscore"]) == (0.0, 0.0, 0.0)

@@ -79,6 +79,23 @@ def test_what_no_view_shows_takes_the_nearest_camera(tube: Tube) -> None:
     assert torch.allclose(baked.sh0[last], one.sh0[last], atol=1e-4)
 
 
+def test_what_lies_beyond_the_mask_of_a_view_is_not_lit_by_it(tube: Tube) -> None:
+    train = tube.sequence.training_cameras[[0, 5]]
+    both = np.ones((2, train.height, train.width), dtype=bool)
+    first_alone = both.copy()
+    first_alone[1] = False
+    with torch.no_grad():
+        seen = tube.scene.render(train[0], visibility=True).visibility_max
+    assert seen is not None
+    shown = seen[0] > 0
+    assert 0.1 < float(shown.float().mean()) < 1
+    masked = bake_recorded_light(tube.scene, train, masks=[*first_alone])
+    assert torch.equal(masked.sh0[shown], bake_recorded_light(tube.scene, train[:1]).sh0[shown])
+    whole = bake_recorded_light(tube.scene, train)
+    assert torch.equal(bake_recorded_light(tube.scene, train, masks=[*both]).sh0, whole.sh0)
+    assert not torch.allclose(masked.sh0[shown], whole.sh0[shown], atol=1e-3)
+
+
 def test_without_light_only_the_exposure_counts(tube: Tube, views: Cameras) -> None:
     plain = Scene(tube.scene.gaussians)
     assert psnr(Scene(bake_light(plain)), plain, views) > 100

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 import subprocess
@@ -16,7 +17,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from extrags.cameras import Cameras
-from extrags.errors import CaptureError
+from extrags.errors import CaptureError, SourceError
 from extrags.gaussians import SH_C0, Gaussians
 from extrags.scene import Scene
 from extrags.splat_files import (
@@ -146,6 +147,22 @@ def test_gaussians_elsewhere(
     write(few, here)
     write(few.to(elsewhere), there)
     assert here.read_bytes() == there.read_bytes()
+
+
+@pytest.mark.parametrize(("factor", "kind"), [(1e5, "larger"), (1e-6, "smaller")])
+def test_spz_refuses_sizes_that_it_has_not(
+    factor: float, kind: str, baked: Gaussians, tmp_path: Path
+) -> None:
+    values = baked.parameters()
+    values["scales"] = values["scales"] + math.log(factor)
+    with pytest.raises(SourceError, match=f"100 % of the Gaussians are {kind} than SPZ can hold"):
+        write_spz(Gaussians(**values), tmp_path / "a.spz")
+    # One alone does no harm, and the thinnest axis may be thinner.
+    values = baked.parameters()
+    values["scales"] = values["scales"].clone()
+    values["scales"][0] = values["scales"][0] + math.log(factor)
+    values["scales"].scatter_(1, values["scales"].argmin(dim=1, keepdim=True), -14.0)
+    write_spz(Gaussians(**values), tmp_path / "a.spz")
 
 
 def test_what_spz_holds(baked: Gaussians, tmp_path: Path) -> None:

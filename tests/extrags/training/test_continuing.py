@@ -148,6 +148,32 @@ class TestStart:
         others = gone[torch.randperm(len(gone), generator=torch.Generator().manual_seed(0))]
         assert lost(gone) < 0.3 * lost(others)
 
+    def test_what_shows_beyond_the_masks_gives_room_first(
+        self, tube_sequence: EndoscopicSequence, old_frames: np.ndarray, first: Scene
+    ) -> None:
+        """A round picture: what a scene shows in its corners is not what the frames tell."""
+        x, y = np.meshgrid(*(np.linspace(-1, 1, size) for size in tube_sequence.rgb.shape[2:0:-1]))
+        inside = np.broadcast_to(np.hypot(x, y) < 0.6, tube_sequence.mask.shape)
+        cameras = tube_sequence.cameras[tube_sequence.train]
+        limit = len(first.gaussians) * 2 // 3
+        full = CONFIG.model_copy(update={"densify": DensifyConfig(enabled=True, max_gaussians=limit)})
+
+        def lost(mask: np.ndarray) -> float:
+            """Squared difference inside the picture when what gave room is missing."""
+            start = continued_start(
+                EarlierScene(first, old_frames, 10),
+                replace(tube_sequence, mask=mask),
+                tube_sequence.train,
+                full,
+            )
+            kept = torch.isin(first.gaussians.means[:, 0], start.gaussians.means[:, 0])
+            fewer = Scene(first.gaussians.subset(kept), first.light)
+            with torch.no_grad():
+                off = (fewer.render(cameras).rgb - first.render(cameras).rgb).square()
+            return float(off.mean(dim=-1)[:, torch.from_numpy(inside[0].copy())].mean())
+
+        assert lost(inside.copy()) < 0.5 * lost(np.ones_like(inside))
+
     def test_points_of_new_frames_leave_the_others_their_share(
         self, tube_sequence: EndoscopicSequence, old_frames: np.ndarray, first: Scene
     ) -> None:
