@@ -258,7 +258,8 @@ def run_cell(cell: Cell, store: str) -> dict[str, Any]:
     peaks = [row.peak_mib for row in counted if row.peak_mib is not None]
     name, _, setting = cell.sequence.partition("@")
     failed = next((row for row in outcome.stages if row.state == "failed"), None)
-    read = outcome.refs.get("sequence")
+    # Where poses are estimated or refined, the sequence is theirs, and does not count its pixels.
+    read = outcome.refs.get("ingest")
     counts = {} if read is None else Store(store).manifest(read).counts
     return {
         "method": cell.method,

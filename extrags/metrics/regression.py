@@ -97,7 +97,7 @@ def compare_results(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict
     sides = [_grouped(found[0], sizes), _grouped(found[1], sizes[::-1])]
     common = [group for group in sides[0] if group in sides[1]]
     if not common:
-        raise ConfigError("the two results have no method, budget and sequence in common")
+        raise ConfigError("the two results have no method, budget, sequence and size of images in common")
     same = all(
         (before.get("machine") or {}).get(key) == (after.get("machine") or {}).get(key) for key in MACHINE
     )
@@ -154,6 +154,10 @@ def _is_case(case: Any, known: Sequence[str]) -> bool:
         return False
     names = [case.get(name) for name in (*GROUP, "error")]
     numbers = [case.get(name) for name in ("seed", "repeat", *COST_NAMES)]
+    size = case.get("image_size") or (None, None)
+    if not isinstance(size, list | tuple) or len(size) != len(SIZE):
+        return False
+    numbers += size
     try:
         for name in known:
             figure_of(case["metrics"], name)
@@ -170,10 +174,16 @@ def _sizes(cases: Sequence[Mapping[str, Any]]) -> dict[tuple[Any, ...], set[tupl
     """The sizes of images of all runs that have something in common but these."""
     found: dict[tuple[Any, ...], set[tuple[Any, ...]]] = {}
     for case in cases:
-        size = tuple(case.get(key) for key in SIZE)
+        size = _size(case)
         if any(size):
             found.setdefault(_but_size(case), set()).add(size)
     return found
+
+
+def _size(case: Mapping[str, Any]) -> tuple[Any, ...]:
+    """Width and height in px, as results of `bench pipeline` or of `benchmark` have it; None: not known."""
+    named = tuple(case.get(key) for key in SIZE)
+    return named if any(named) else tuple(case.get("image_size") or (None, None))
 
 
 def _but_size(case: Mapping[str, Any]) -> tuple[Any, ...]:
@@ -191,10 +201,10 @@ def _grouped(
     """
     found: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
     for case in cases:
-        # Results of `benchmark` have no budgets or sizes.
-        group, size = _but_size(case), tuple(case.get(key) for key in SIZE)
-        if case["error"] and not any(size):
-            # It failed while its frames were read, before their size was known: that of other runs of it.
+        # Results of `benchmark` have no budgets, and earlier ones no sizes.
+        group, size = _but_size(case), _size(case)
+        if not any(size):
+            # Or it failed while its frames were read, before it was known. That of other runs of it.
             known = next((side[group] for side in sizes if len(side.get(group, ())) == 1), {size})
             (size,) = known
         found.setdefault((*group, *size), []).append(case)

@@ -151,6 +151,13 @@ class TestGrid:
         (case,) = run_grid(found, tmp_path / "grid", run=run_cell)["cases"]
         assert "the folder is empty" in case["error"]
 
+    def test_refined_poses_keep_the_size(self, tmp_path: Path) -> None:
+        """The sequence is then that of the poses, whose counts have no pixels."""
+        found = cells(**{"coarse.refine_poses": True})
+        (case,) = run_grid(found[:1], tmp_path / "grid", run=run_cell)["cases"]
+        assert case["error"] == ""
+        assert (case["width"], case["height"], case["frames"]) == (48, 40, 8)
+
     def test_another_machine_needs_another_folder(self, tmp_path: Path) -> None:
         run_grid(cells(), tmp_path, run=lambda cell, _: _case(cell))
         claim = json.loads((tmp_path / "grid.json").read_text())

@@ -229,6 +229,27 @@ class TestRunsThatFailedWhileReading:
         assert len(found["failed"]) == 1
 
 
+class TestSizesOfABenchmark:
+    def sized(self, size: list[int] | None, worse_db: float = 0.0) -> dict[str, Any]:
+        found = result(worse_db=worse_db)
+        for case in found["cases"]:
+            case["image_size"] = size
+        return found
+
+    def test_images_of_another_size_are_no_regression(self) -> None:
+        with pytest.raises(ConfigError, match="no method, budget, sequence and size of images in common"):
+            compare_results(self.sized([48, 40]), self.sized([675, 540], worse_db=1.5))
+
+    def test_of_one_size_they_are_compared(self) -> None:
+        found = compare_results(self.sized([48, 40]), self.sized([48, 40], worse_db=1.5))
+        assert verdicts(found)["psnr"] == "worse"
+
+    def test_earlier_results_did_not_tell(self) -> None:
+        found = compare_results(result(), self.sized([48, 40], worse_db=1.5))
+        assert verdicts(found)["psnr"] == "worse"
+        assert found["missing"] == []
+
+
 @pytest.mark.parametrize(("now", "verdict"), [(1e-5, "noise"), (0.3, "better"), (0.0, "equal")])
 def test_a_figure_that_was_zero_has_no_shares(now: float, verdict: str) -> None:
     sides = [result(), result()]
@@ -254,6 +275,8 @@ def _with(**changes: Any) -> dict[str, Any]:
         {**result(), "machine": "x"},
         _with(sequence=["phantom/0"]),
         _with(seed={}),
+        _with(image_size=[48]),
+        _with(image_size="48x40"),
         _with(seconds="long"),
         _with(metrics=[20.0]),
         _with(metrics={"psnr": "good"}),
