@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from pydantic import BaseModel, ConfigDict
 
 from data_catalog.catalog import read, resolve
@@ -150,7 +151,7 @@ def facts(sequence: EndoscopicSequence) -> dict[str, Any]:
         known = zip(depths, sequence.mask, strict=True)
         result["depth_known_share"] = sum(int(((depth > 0) & mask).sum()) for depth, mask in known) / inside
         result["depth"] = {
-            name: quantile_of_frames(lambda: (depth[depth > 0] for depth in depths), share) or 0.0
+            name: quantile_of_frames(lambda: _known_depths(sequence), share) or 0.0
             for name, share in (("p1", 0.01), ("median", 0.5), ("p99", 0.99))
         }
     if sequence.observed is not None and len(sequence.test):
@@ -159,6 +160,13 @@ def facts(sequence: EndoscopicSequence) -> dict[str, Any]:
         if seen + unseen:
             result["observed_share"] = seen / (seen + unseen)
     return result
+
+
+def _known_depths(sequence: EndoscopicSequence) -> Iterator[Float[np.ndarray, "n"]]:
+    """Those inside the mask, of one frame after the other: what lies beyond is no tissue."""
+    assert sequence.depth_mm is not None
+    for depth, mask in zip(sequence.depth_mm, sequence.mask, strict=True):
+        yield depth[(depth > 0) & mask]
 
 
 def contact_sheet(sequence: EndoscopicSequence) -> UInt8[np.ndarray, "h w 3"]:
@@ -177,8 +185,7 @@ def contact_sheet(sequence: EndoscopicSequence) -> UInt8[np.ndarray, "h w 3"]:
     )
     farthest = 1.0
     if sequence.depth_mm is not None:
-        depths = sequence.depth_mm
-        farthest = quantile_of_frames(lambda: (depth[depth > 0] for depth in depths), 0.99) or farthest
+        farthest = quantile_of_frames(lambda: _known_depths(sequence), 0.99) or farthest
     height = round(_TILE_WIDTH * sequence.height / sequence.width)
     tiles = []
     for index, shine in zip(chosen.tolist(), specular, strict=True):

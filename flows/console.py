@@ -18,6 +18,8 @@ __all__ = ["print_failures", "print_outcomes", "print_plan"]
 
 def print_outcomes(run: DatasetOutcome, seconds: float) -> None:
     """Print a table of results, one row per sequence; in a narrow terminal, one line per figure."""
+    from extrags.metrics.comparison import figure_of
+
     out = console(error=True)
     table = Table(box=None, pad_edge=False, header_style="bold")
     table.add_column("sequence", overflow="fold")
@@ -33,14 +35,14 @@ def print_outcomes(run: DatasetOutcome, seconds: float) -> None:
             escape(outcome.title),
             f"[{color}]{outcome.status}[/]",
             _counts(outcome),
-            *(_change(name, coarse.get(name), final.get(name)) for name in columns),
+            *(_change(name, figure_of(coarse, name), figure_of(final, name)) for name in columns),
         )
         if restored := outcome.metrics.get("restored"):
             table.add_row(
                 "[dim]  restored[/]",
                 "",
                 "",
-                *(_change(name, final.get(name), restored.get(name)) for name in columns),
+                *(_change(name, figure_of(final, name), figure_of(restored, name)) for name in columns),
             )
     # No word is broken but a name, which may be folded to a third of the width.
     names = max((len(outcome.title) for outcome in run.sequences), default=0)
@@ -71,15 +73,21 @@ def _counts(outcome: SequenceOutcome) -> str:
 
 def _print_lines(out: Console, outcome: SequenceOutcome, columns: Sequence[str]) -> None:
     """What the table has in a sequence's rows, below each other."""
+    from extrags.metrics.comparison import figure_of
+
     color = "green" if outcome.status == "ok" else "red"
     out.print(f"{escape(outcome.title)}: [{color}]{outcome.status}[/]", soft_wrap=True)
     out.print(f"  {_counts(outcome)}", soft_wrap=True)
     coarse, final, restored = (outcome.metrics.get(which) or {} for which in ("coarse", "final", "restored"))
     # A table has a dash for what was not measured.
-    for name in (name for name in columns if coarse.get(name) is not None or final.get(name) is not None):
-        out.print(f"  {name} {_change(name, coarse.get(name), final.get(name))}", soft_wrap=True)
+    for name in columns:
+        if figure_of(coarse, name) is None and figure_of(final, name) is None:
+            continue
+        out.print(
+            f"  {name} {_change(name, figure_of(coarse, name), figure_of(final, name))}", soft_wrap=True
+        )
         if restored:
-            change = _change(name, final.get(name), restored.get(name))
+            change = _change(name, figure_of(final, name), figure_of(restored, name))
             out.print(f"  [dim]{name}, restored[/] {change}", soft_wrap=True)
 
 

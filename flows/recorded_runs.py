@@ -221,6 +221,7 @@ def compared_run(store: Store, run: RecordedRun, name: str, target: str = "") ->
         seconds=sum(float(stage["made_seconds"]) for stage in stages) if stages else None,
         link="" if page is None else _address(f"{page.uri}/{PAGE}", target),
         held_out_trained_on=run.record is not None and held_out_trained_on(run.record),
+        imported=_is_imported(run),
     )
 
 
@@ -313,8 +314,12 @@ def _knowledge(run: RecordedRun) -> str:
     """What is to be said of a scene that may have seen the held-out frames; empty of one that has not."""
     if run.record is not None and held_out_trained_on(run.record):
         return HELD_OUT_TRAINED_ON.capitalize()
-    imported = run.report.config["config"].get("imported", {}).get("scene")
-    return "The scene is imported: whether it has seen the held-out frames is not known" if imported else ""
+    unknown = "The scene is imported: whether it has seen the held-out frames is not known"
+    return unknown if _is_imported(run) else ""
+
+
+def _is_imported(run: RecordedRun) -> bool:
+    return bool(run.report.config["config"].get("imported", {}).get("scene"))
 
 
 def board_rows(store: Store, patterns: Sequence[str] = (), target: str = "") -> list[BoardRow]:
@@ -358,6 +363,10 @@ def board_rows(store: Store, patterns: Sequence[str] = (), target: str = "") -> 
                 metrics=tree.get("final") or tree.get("coarse"),
                 protocol=record.get("protocol"),
                 held_out_trained_on=held_out_trained_on(record),
+                imported=any(
+                    settings.get("imported.scene")
+                    for settings in (record["variant"], record.get("settings", {}))
+                ),
                 link="" if page is None else _address(page, target),
             )
         )

@@ -64,6 +64,8 @@ def _cell(value: Any) -> str:
 
 def sequence_markdown(outcome: SequenceOutcome) -> str:
     """Stages, metrics and where the report is."""
+    from extrags.metrics.comparison import figure_of
+
     stages = markdown_table(
         ["stage", "state", "seconds", "made in", "reason"],
         [
@@ -75,7 +77,11 @@ def sequence_markdown(outcome: SequenceOutcome) -> str:
     metrics = markdown_table(
         ["scene", *columns, "Gaussians"],
         [
-            [which, *(figure(name, tree.get(name)) for name in columns), _count(tree.get("n_gaussians"))]
+            [
+                which,
+                *(figure(name, figure_of(tree, name)) for name in columns),
+                _count(tree.get("n_gaussians")),
+            ]
             for which, tree in outcome.metrics.items()
             if tree is not None
         ],
@@ -86,6 +92,8 @@ def sequence_markdown(outcome: SequenceOutcome) -> str:
 
 def dataset_markdown(outcomes: Sequence[SequenceOutcome]) -> str:
     """One row per sequence: coarse and final figures, or why it failed."""
+    from extrags.metrics.comparison import figure_of
+
     columns = table_figures(*(tree for outcome in outcomes for tree in outcome.metrics.values()))[:3]
     rows = []
     for outcome in outcomes:
@@ -96,7 +104,10 @@ def dataset_markdown(outcomes: Sequence[SequenceOutcome]) -> str:
                 outcome.title,
                 outcome.status,
                 f"{outcome.seconds:.1f}",
-                *(f"{figure(name, coarse.get(name))} → {figure(name, final.get(name))}" for name in columns),
+                *(
+                    f"{figure(name, figure_of(coarse, name))} → {figure(name, figure_of(final, name))}"
+                    for name in columns
+                ),
                 "" if failed is None else f"{failed.stage}: {failed.reason}",
             ]
         )
@@ -115,7 +126,7 @@ def judgement_markdown(found: Judgement) -> str:
 
 def benchmark_markdown(cases: Sequence[dict[str, Any]], baseline: str) -> str:
     """Paired differences of each dataset, spread of each sequence, and one row per run."""
-    from extrags.metrics.comparison import CEILING, compare_runs
+    from extrags.metrics.comparison import CEILING, compare_runs, figure_of
 
     comparison = compare_runs(cases, baseline)
     trees = [case["metrics"] for case in cases]
@@ -162,7 +173,7 @@ def benchmark_markdown(cases: Sequence[dict[str, Any]], baseline: str) -> str:
                 case["seed"],
                 f"{case['seconds']:.1f}",
                 "" if case["peak_mib"] is None else f"{case['peak_mib']:.0f}",
-                *(figure(name, (case["metrics"] or {}).get(name)) for name in columns),
+                *(figure(name, figure_of(case["metrics"] or {}, name)) for name in columns),
                 case["error"],
             ]
             for case in cases

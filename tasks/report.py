@@ -32,7 +32,7 @@ REPORT_PARTS: tuple[Part, ...] = tuple(part for stage in REGISTRY for part in st
 
 # `rows` holds the times of the stages in this run. The page shows them, but they are not part of its cache
 # key.
-@stage("report", version=19, ignore=("rows",))
+@stage("report", version=20, ignore=("rows",))
 def report(
     slot: Slot,
     name: str,
@@ -145,7 +145,7 @@ def _absent(skipped: dict[str, str]) -> dict[str, str]:
     }
 
 
-@stage("dataset-report", version=7, ignore=("rows",))
+@stage("dataset-report", version=8, ignore=("rows",))
 def dataset_report(
     slot: Slot,
     name: str,

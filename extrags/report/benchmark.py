@@ -199,8 +199,7 @@ def _mean_cell(found: Mapping[str, Any], column: Figure) -> dict[str, str]:
 
 def _difference_cell(found: Mapping[str, Any], column: Figure) -> dict[str, str]:
     figure = found[column.name]
-    if (more := _more_covered(found, column)) is not None:
-        note = f"over {'more' if more > 0 else 'fewer'} pixels: see the coverage"
+    if note := _apart(found, column):
         return {**NO_CELL, "value": number(figure["mean"], column.digits, signed=True), "note": note}
     if round(figure["mean"], column.digits) == 0:
         verdict = "equal"
@@ -214,10 +213,25 @@ def _difference_cell(found: Mapping[str, Any], column: Figure) -> dict[str, str]
     }
 
 
-def _more_covered(found: Mapping[str, Any], column: Figure) -> float | None:
-    """The difference in coverage where it is too large for the figure to be judged; else None."""
-    share = found.get(column.coverage)
-    return None if share is None or same_pixels(0.0, share["mean"]) else float(share["mean"])
+def _apart(found: Mapping[str, Any], column: Figure) -> str:
+    """Why the figure of a row of differences is not judged: it is over other pixels; else empty.
+
+    A scene that leaves out what is hard looks accurate: the accuracy of the surface is judged where as much
+    of the true one was found.
+    """
+    group, _, name = column.name.rpartition(".")
+    of_surface = name == "accuracy_mm"
+    share = found.get(f"{group}.recall" if of_surface else column.coverage)
+    if share is None:
+        return ""
+    # One pair whose pixels differ is enough; those of two may differ in opposite ways.
+    fewer, more = (not same_pixels(0.0, share[end]) for end in ("smallest", "largest"))
+    fewer, more = fewer and share["smallest"] < 0, more and share["largest"] > 0
+    if not fewer and not more:
+        return ""
+    if of_surface:
+        return f"over {'other parts' if fewer and more else 'more' if more else 'less'} of the surface"
+    return f"over {'other' if fewer and more else 'more' if more else 'fewer'} pixels: see the coverage"
 
 
 def _share_cell(found: Mapping[str, Any], column: Figure) -> dict[str, str]:
@@ -254,9 +268,7 @@ def _difference_chart(
         given = [row["figures"].get(panel.name) for panel in panels]
         cells = [None if found is None else (found["mean"], found["low"], found["high"]) for found in given]
         unjudged |= {
-            (len(lines), place)
-            for place, panel in enumerate(panels)
-            if _more_covered(row["figures"], panel) is not None
+            (len(lines), place) for place, panel in enumerate(panels) if _apart(row["figures"], panel)
         }
         lines.append((f"{row['method']}, {line_of(row)}" if several else line_of(row), cells))
     titles = [
@@ -271,23 +283,26 @@ def _figure_charts(
     runs: Sequence[Mapping[str, Any]], columns: Sequence[Figure], inputs: BenchmarkInputs
 ) -> list[tuple[Chart, str]]:
     known = {column.name: column for column in columns}
-    # Whole-mask figures only where the source cannot tell what was observed.
-    drawn = [figure.name for figure in figures("charts")[:2]]
-    names = [name for name in drawn if name in known] or [name for name in ("psnr",) if name in known]
+    names = [figure.name for figure in figures("charts")[:2] if figure.name in known]
+    # Of all pixels only where some source cannot tell what was observed.
+    told = [run for run in runs if any(figure_of(run["metrics"], name) is not None for name in names)]
+    names += [name for name in ("psnr",) if name in known and len(told) < len(runs)]
     line_of = _line_names(runs)
-    groups = list(dict.fromkeys(line_of(run) for run in runs))
     charts = []
     for name in names:
         having = [run for run in runs if figure_of(run["metrics"], name) is not None]
         title = f"{known[name].label} ({known[name].unit})"
         chart = methods_chart(
-            groups,
+            list(dict.fromkeys(line_of(run) for run in having)),
             _by_method(having, [figure_of(run["metrics"], name) or 0.0 for run in having], line_of),
             _by_method(having, [float(run["seconds"]) for run in having], line_of),
             method_colors(list(inputs.methods), inputs.baseline),
             title,
         )
-        alt = f"{title} on held-out views of every run, by sequence and method, and against run time"
+        which = (
+            "every run" if len(having) == len(runs) else f"the {len(having)} of {len(runs)} runs that have it"
+        )
+        alt = f"{title} on held-out views of {which}, by sequence and method, and against run time"
         charts.append((chart, alt))
     return charts
 

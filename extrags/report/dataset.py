@@ -22,6 +22,7 @@ from extrags.report.wording import (
     duration,
     metric_of,
     number,
+    same_pixels,
     shown_metrics,
 )
 
@@ -211,13 +212,22 @@ def _mean_cell(
     having = [[row for row in group if _both(row, metric, path) is not None] for group in groups]
     pairs = _means(having, metric, path)
     if not pairs:
-        return {"comparison": compare(metric, None, None), "deviation": ""}
+        return {"comparison": compare(metric, None, None), "deviation": "", "n": 0}
     coarse, final = np.array(pairs).T
     coverage: tuple[float | None, float | None] = (None, None)
     if metric.coverage and (shares := _means(having, metric_named(metric.coverage), path)):
         coverage = (fmean(first for first, _ in shares), fmean(last for _, last in shares))
     comparison = compare(metric, float(coarse.mean()), float(final.mean()), coverage=coverage)
-    return {"comparison": comparison, "deviation": _deviation(final - coarse, metric.digits)}
+    if metric.coverage:
+        # One row whose pixels differ is enough for the means to be of different pixels.
+        of_rows = _pairs([row for group in having for row in group], metric_named(metric.coverage), path)
+        if not all(same_pixels(*shares) for shares in of_rows):
+            comparison = replace(comparison, verdict="other pixels")
+    return {
+        "comparison": comparison,
+        "deviation": _deviation(final - coarse, metric.digits),
+        "n": len(pairs),
+    }
 
 
 def _seed_rows(rows: Sequence[DatasetRow], metrics: Sequence[Metric]) -> list[dict[str, Any]]:

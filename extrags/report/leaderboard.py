@@ -36,6 +36,7 @@ class BoardRow:
         link: address of its page; empty for none.
         protocol: version of the evaluation protocol that the metrics are by; None for records that lack it.
         held_out_trained_on: its scene has seen the frames that its figures are of.
+        imported: its scene was made elsewhere; nobody knows whether it has seen them.
     """
 
     sequence: str
@@ -52,6 +53,7 @@ class BoardRow:
     link: str = ""
     protocol: int | None = None
     held_out_trained_on: bool = False
+    imported: bool = False
 
     @property
     def dataset(self) -> str:
@@ -131,6 +133,11 @@ def _warnings(rows: Sequence[BoardRow]) -> list[str]:
         found.append(
             f"Held-out frames were trained on in {', '.join(columns)}, which is never marked as best."
         )
+    if columns := _distinct(row.column for row in rows if row.imported):
+        found.append(
+            "Whether the held-out frames were trained on is not known of imported scenes, which are not "
+            f"marked as best either: {', '.join(columns)}."
+        )
     protocols = {row.protocol for row in rows if row.metrics is not None}
     if len(protocols) > 1:
         known = ", ".join(str(version) for version in sorted(item for item in protocols if item is not None))
@@ -162,7 +169,7 @@ def _board(rows: Sequence[BoardRow], figure: Figure, profile: str) -> dict[str, 
     if not values:
         return None
     methods = _distinct(method for _, method in values)
-    ceilings = {row.column for row in rows if row.held_out_trained_on}
+    ceilings = {row.column for row in rows if row.held_out_trained_on or row.imported}
     rivals = [method for method in methods if method not in ceilings]
     sequences = _distinct(sequence for sequence, _ in values)
     datasets = {row.sequence: row.dataset for row in rows}

@@ -15,7 +15,7 @@ _LABELS: dict[str, tuple[str, Kind]] = {
     "lacking_share": ("What nearby views lack: holes, and unresolved surface by its weight", "share"),
     "hole_share": ("Holes in nearby views", "share"),
     "unresolved_share": ("Unresolved surface in nearby views", "share"),
-    "worst_probe_lacking_share": ("The same of the worst nearby view", "share"),
+    "worst_probe_lacking_share": ("What the worst nearby view lacks", "share"),
     "training_hole_share": ("Holes in the training views", "share"),
     "gaussians": ("Gaussians", "count"),
     "gaussians_unseen_share": ("Gaussians that no training view sees", "share"),

@@ -216,7 +216,7 @@ def protocol(inputs: ReportInputs) -> dict[str, Any]:
     trees = (metrics_of(inputs.coarse_metrics), metrics_of(inputs.final_metrics))
     return {
         "version": result.get("protocol"),
-        "metrics": described_metrics(*trees),
+        "metrics": described_metrics(*trees, reasons="the reason stands below the table of numbers"),
         "surface": _has_surface(*trees),
     }
 

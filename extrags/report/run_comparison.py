@@ -10,7 +10,8 @@ import numpy as np
 
 from extrags.errors import ConfigError, ShapeError
 from extrags.metrics.registry import Metric
-from extrags.report.charts import drawing_style, method_marks, run_colors, svg_image
+from extrags.report.chart_labels import row_labels
+from extrags.report.charts import LEGEND_COLUMNS, drawing_style, method_marks, run_colors, svg_image
 from extrags.report.downloads import Cell, Chart, csv_uri, file_name
 from extrags.report.encode import as_uint8
 from extrags.report.image_table import ImageTable, Judged, evenly_spaced, judged_table
@@ -37,6 +38,9 @@ MOST_PICTURED = 4
 """Runs whose renders stand side by side; more would be too small to be judged."""
 IMAGE_BYTES = 4_500_000
 """For all pictures together."""
+LEGEND_LETTERS = 110
+"""So many letters are a line of the legend."""
+LEGEND_LINE_IN = 0.16
 
 
 @dataclass(frozen=True)
@@ -51,6 +55,7 @@ class ComparedRun:
         seconds: its stages took; None where nobody has measured.
         link: address of its own page; empty for none.
         held_out_trained_on: its scene has seen these views.
+        imported: its scene was made elsewhere; nobody knows whether it has seen them.
         held_out: digest of the images and masks that its figures are of; empty where it is not known.
     """
 
@@ -61,6 +66,13 @@ class ComparedRun:
     seconds: float | None = None
     link: str = ""
     held_out_trained_on: bool = False
+    imported: bool = False
+
+    @property
+    def unseen(self) -> bool:
+        """Whether it is known not to have seen these views."""
+        return not (self.held_out_trained_on or self.imported)
+
     held_out: str = ""
 
 
@@ -132,17 +144,23 @@ def _summary(runs: Sequence[ComparedRun]) -> str:
     ceilings = [run.name for run in runs if run.held_out_trained_on]
     if ceilings:
         text += f" Held-out frames were trained on in {', '.join(ceilings)}."
+    if imported := [run.name for run in runs if run.imported]:
+        text += (
+            " Whether they were trained on is not known of imported scenes, which are not marked as best: "
+            f"{', '.join(imported)}."
+        )
     known = [
-        (value, run.name)
-        for value, run in zip(values, runs, strict=True)
-        if value is not None and not run.held_out_trained_on
+        (value, run.name) for value, run in zip(values, runs, strict=True) if value is not None and run.unseen
     ]
     if not known:
         return text
     best, name = max(known, key=lambda item: item[0])
     text += f" The highest PSNR is that of {name}, {number(best, 2)} dB"
     first = values[0]
-    if first is None or name == runs[0].name or runs[0].held_out_trained_on:
+    if runs[0].unseen and _same(first, best, 2):
+        # Others may be written alike; the first one is what all are held against.
+        return text.replace(f"that of {name}", f"that of {runs[0].name}") + "."
+    if first is None or not runs[0].unseen:
         return text + "."
     return f"{text}, {number(best - first, 2)} dB above {runs[0].name}."
 
@@ -166,12 +184,10 @@ def _figures(runs: Sequence[ComparedRun], metrics: Sequence[Metric]) -> list[dic
             if all(value is None for value in values):
                 continue
             known = [
-                value
-                for value, run in zip(values, runs, strict=True)
-                if value is not None and not run.held_out_trained_on
+                value for value, run in zip(values, runs, strict=True) if value is not None and run.unseen
             ]
             best = max(known, default=None) if metric.higher_is_better else min(known, default=None)
-            rivals = [share for share, run in zip(shares, runs, strict=True) if not run.held_out_trained_on]
+            rivals = [share for share, run in zip(shares, runs, strict=True) if run.unseen]
             if not same_pixels(*rivals):
                 best = None
             rows.append(
@@ -181,9 +197,7 @@ def _figures(runs: Sequence[ComparedRun], metrics: Sequence[Metric]) -> list[dic
                     "cells": [
                         {
                             "value": number(value, metric.digits),
-                            "best": len(known) > 1
-                            and not run.held_out_trained_on
-                            and _same(value, best, metric.digits),
+                            "best": len(known) > 1 and run.unseen and _same(value, best, metric.digits),
                             "change": compare(metric, values[0], value, coverage=(shares[0], shares[place]))
                             if place
                             else None,
@@ -252,11 +266,17 @@ def _views_chart(sequence: EndoscopicSequence, runs: Sequence[ComparedRun]) -> C
     colors = run_colors(list(values))
     marks = method_marks(colors)
     order = np.arange(len(sequence.test)) + 1
+    labels = row_labels(list(values))
+    columns = next(
+        (count for count in range(LEGEND_COLUMNS, 1, -1) if count * max(map(len, labels)) <= LEGEND_LETTERS),
+        1,
+    )
+    lines = -(-len(labels) // columns)
     with drawing_style():
-        figure = Figure(figsize=(9.6, 2.8), layout="constrained")
+        figure = Figure(figsize=(9.6, 2.8 + LEGEND_LINE_IN * lines), layout="constrained")
         FigureCanvasAgg(figure)
         axes: Any = figure.add_subplot()
-        for name, psnr in values.items():
+        for label, (name, psnr) in zip(labels, values.items(), strict=True):
             axes.plot(
                 order,
                 psnr,
@@ -264,12 +284,13 @@ def _views_chart(sequence: EndoscopicSequence, runs: Sequence[ComparedRun]) -> C
                 marker=marks[name],
                 markersize=3.5,
                 linewidth=1.2,
-                label=name,
+                label=label,
             )
         axes.set_title("PSNR of each held-out view (dB)")
         axes.set_xlabel("held-out view, in the order of the recording")
         axes.xaxis.get_major_locator().set_params(integer=True)
-        axes.legend(ncols=min(4, len(runs)), loc="best")
+        # Not over the lines: names of runs have the settings that set them apart.
+        figure.legend(ncols=columns, loc="outside lower center")
         chart = svg_image(figure)
     rows = [
         [

@@ -243,8 +243,13 @@ def with_coverages(shown: Sequence[Metric]) -> list[Metric]:
     return found
 
 
-def described_metrics(*trees: Mapping[str, Any] | None) -> dict[str, str]:
-    """What the metrics of a page are, in words, by their label; all networks of LPIPS together."""
+def described_metrics(*trees: Mapping[str, Any] | None, reasons: str = "") -> dict[str, str]:
+    """What the metrics of a page are, in words, by their label; all networks of LPIPS together.
+
+    Args:
+        trees: figures of the runs on the page.
+        reasons: where it says why a figure is missing; empty where it does not.
+    """
     found = {}
     shown = shown_metrics(*trees)
     networks = " and ".join(metric.network for metric in _measured(shown, trees) if metric.network)
@@ -256,8 +261,8 @@ def described_metrics(*trees: Mapping[str, Any] | None) -> dict[str, str]:
             f"Version 0.1, on the network {networks}. Figures of another network cannot be compared with "
             "these."
             if networks
-            else "Not measured in this run; the reason stands below the table of numbers. Where it is "
-            "measured, its network is named."
+            else f"Not measured here; {reasons or 'the page of a sequence says why'}. Where it is measured, "
+            "its network is named."
         )
     return found
 

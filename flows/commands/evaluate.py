@@ -143,7 +143,8 @@ def _print(found: dict[str, Any]) -> None:
     out = console()
     table = Table(box=None, pad_edge=False, header_style="bold")
     metrics = found["metrics"]
-    columns = table_figures(metrics)
+    # Its rows are the groups, which a figure of one group has in its name.
+    columns = [name for name in table_figures(metrics) if "." not in name]
     for column in ("pixels", *columns):
         table.add_column(column)
     for group in GROUPS:

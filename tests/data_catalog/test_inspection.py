@@ -315,6 +315,9 @@ class TestFacts:
         assert found["masked_share"] == pytest.approx(0.25)
         assert found["depth_known_share"] == 1
         assert found["depth"]["p1"] < found["depth"]["median"] < found["depth"]["p99"]
+        far = np.where(mask, clip.depth_mm, np.float32(5000))
+        beyond = facts(replace(clip, mask=mask, depth_mm=far))
+        assert beyond["depth"] == found["depth"]
         assert found["field_of_view_deg"] == pytest.approx(96, abs=0.5)
         assert 0 < found["specular_share"] < 0.1
         assert found["reach"] > 50

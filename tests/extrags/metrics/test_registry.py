@@ -188,6 +188,19 @@ class TestOwnMetric:
             assert "Toy error" in page.split("How the numbers are taken")[0]
             assert "What the toy says of itself." in page.split("How the numbers are taken")[1]
 
+    def test_a_figure_of_one_group_of_pixels_stands_in_tables(
+        self, sequence: EndoscopicSequence, toy: Metric
+    ) -> None:
+        unregister_metric("toy_error")
+        register_metric(replace(toy, shown={**toy.shown, "tables": ("observed",)}))
+        tree = evaluated(sequence, OFFSET).metrics
+        outcome = SequenceOutcome("made/up", metrics={"coarse": tree, "final": tree})
+        for table in (sequence_markdown(outcome), benchmark_markdown([run("3dgs", tree)], "3dgs")):
+            (head,) = [line for line in table.splitlines() if "observed.toy_error" in line][-1:]
+            row = table.splitlines()[table.splitlines().index(head) + 2]
+            place = head.split("|").index(" observed.toy_error ")
+            assert row.split("|")[place].strip() == f"{tree['observed']['toy_error']:.4f}"
+
     def test_is_part_of_the_key_of_cached_results(self, toy: Metric) -> None:
         assert added_metrics() == ["toy_error@1"]
         unregister_metric("toy_error")

@@ -220,3 +220,47 @@ def test_depth_over_different_pixels_is_not_judged() -> None:
     assert "Depth AbsRel ↓ +0.010 over more pixels: see the coverage" in differences
     assert "Depth coverage ↑ +0.100 better" in differences
     assert "Depth AbsRel ↓ +0.010 worse" in page_of(1.0).text
+
+
+def test_opposite_differences_in_coverage_do_not_cancel() -> None:
+    runs = runs_of({"phantom/0": 1.0, "phantom/1": 1.0}, seeds=1)
+    for item in runs:
+        fuller = (item["method"] == "coarse") == (item["sequence"] == "phantom/0")
+        item["metrics"] |= {
+            "depth_absrel": 0.03 if item["method"] == "coarse" else 0.05,
+            "depth_coverage": 1.0 if fuller else 0.8,
+        }
+    text = Page(build_benchmark_report(BenchmarkInputs("depth", runs, "3dgs", METHODS))).text
+    assert "Depth AbsRel ↓ −0.020 over other pixels: see the coverage" in text  # noqa: RUF001
+    assert "better in 2 of 2" not in text.split("Depth AbsRel ↓")[1].split("Depth coverage")[0]
+
+
+def test_accuracy_of_less_of_the_surface_is_not_judged() -> None:
+    def page_of(recall: float) -> str:
+        runs = runs_of({"phantom/0": 1.0}, seeds=2)
+        for item in runs:
+            better = item["method"] == "coarse"
+            item["metrics"]["surface"] |= {
+                "accuracy_mm": 0.3 if better else 0.8,
+                "recall": recall if better else 0.9,
+            }
+        return Page(build_benchmark_report(BenchmarkInputs("surface", runs, "3dgs", METHODS))).text
+
+    assert "−0.50 better" in page_of(0.9)  # noqa: RUF001
+    less = page_of(0.2)
+    assert "−0.50 over less of the surface" in less  # noqa: RUF001
+    assert "−0.50 better" not in less  # noqa: RUF001
+
+
+def test_sources_without_geometry_have_a_chart_of_all_pixels() -> None:
+    told, blind = runs_of({"phantom/0": 1.0}, seeds=1), runs_of({"sinus/hopkins": 1.0}, seeds=1)
+    for item in blind:
+        for name in ("observed", "unobserved", "surface"):
+            del item["metrics"][name]
+    page = Page(build_benchmark_report(BenchmarkInputs("both", [*told, *blind], "3dgs", METHODS)))
+    alts = [str(image["alt"]) for image in page.images]
+    assert any("PSNR, observed (dB) on held-out views of the 2 of 4 runs that have it" in alt for alt in alts)
+    assert any(alt.startswith("PSNR (dB) on held-out views of every run") for alt in alts)
+    tables = [lines(link) for link in page.links if link.startswith("data:text/csv;")]
+    named = [{line["sequence"] for line in table} for table in tables if "sequence" in table[0]]
+    assert {"phantom/0@sparse", "sinus/hopkins@sparse"} in named

@@ -233,7 +233,7 @@ def test_lpips_without_weights_says_why(inputs: ReportInputs) -> None:
             part["lpips_alex"] = None
     text = Page(build_report(replace(inputs, coarse_metrics=result, final_metrics=result), CONFIG)).text
     assert "LPIPS (AlexNet): not available, no LPIPS weights were given." in text
-    assert "Not measured in this run" in text
+    assert "Not measured here; the reason stands below the table of numbers." in text
 
 
 def test_what_there_is_not_is_called_what_it_is(inputs: ReportInputs) -> None:

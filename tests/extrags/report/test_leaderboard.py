@@ -147,3 +147,12 @@ def test_no_error_of_depth_is_the_best_over_other_pixels() -> None:
 
     assert "best" in depth_board(1.0)
     assert "best" not in depth_board(0.9)
+
+
+def test_an_imported_scene_is_never_the_best() -> None:
+    theirs = replace(
+        row("phantom/0@sparse", "extrags", 30.0), settings="imported.scene = a.ply", imported=True
+    )
+    page = Page(build_leaderboard([row("phantom/0@sparse", "extrags", 25.0), theirs]))
+    assert "not marked as best either: extrags, imported.scene = a.ply." in page.text
+    assert "30.00 best" not in page.text

@@ -253,3 +253,24 @@ def test_dataset_page_does_not_judge_depth_over_different_pixels() -> None:
     assert "+0.011 worse" in Page(build_dataset_report([covered("a", 1.0, 1.0)])).text
     means = text.split("± between them")[1]
     assert "over more pixels: coverage 85" in means
+
+
+def test_a_mean_says_of_how_many_it_is() -> None:
+    """Depth is known of one of three; opposite coverages of two do not cancel."""
+    known, plain = metrics_of(20.0) | {"depth_absrel": 0.05}, metrics_of(21.0)
+    blind = [metrics_of(psnr) | {"depth_absrel": None} for psnr in (20.0, 21.0)]
+    rows = [
+        DatasetRow("phantom/0", "completed", 60.0, known, plain | {"depth_absrel": 0.04}),
+        *(DatasetRow(name, "completed", 60.0, *blind) for name in ("sinus/0", "sinus/1")),
+    ]
+    means = Page(build_dataset_report(rows)).text.split("of 3, ± between them")[1]
+    assert "0.050 → 0.040 −0.010 better of 1" in means  # noqa: RUF001
+
+    def covered(name: str, before: float, after: float) -> DatasetRow:
+        coarse = metrics_of(20.0) | {"depth_absrel": 0.05, "depth_coverage": before}
+        return DatasetRow(
+            name, "completed", 60.0, coarse, plain | {"depth_absrel": 0.03, "depth_coverage": after}
+        )
+
+    text = Page(build_dataset_report([covered("a", 0.8, 1.0), covered("b", 1.0, 0.8)])).text
+    assert "−0.020 better" not in text  # noqa: RUF001

@@ -144,3 +144,29 @@ def test_no_error_of_depth_is_the_best_over_other_pixels(
     other = text_of(0.9)
     assert "Depth AbsRel ↓ 0.030 +0.010 over other pixels 0.040" in other
     assert "Depth coverage ↑ 0.900 +0.100 better 1.000 best" in other
+
+
+def test_an_imported_scene_may_have_seen_the_views(inputs: ReportInputs, runs: list[ComparedRun]) -> None:
+    theirs = replace(runs[1], name="theirs", imported=True)
+    text = Page(build_run_comparison(inputs.sequence, [runs[0], theirs], views=1)).text
+    assert "not known of imported scenes, which are not marked as best: theirs." in text
+    assert "The highest PSNR is that of 3dgs, 20.00 dB." in text
+    assert "22.50 best" not in text
+
+
+def test_a_tie_names_the_first(inputs: ReportInputs, runs: list[ComparedRun]) -> None:
+    again = replace(runs[0], name="again", result=result_of(20.0001, 1000))
+    text = Page(build_run_comparison(inputs.sequence, [runs[0], again], views=1)).text
+    assert "The highest PSNR is that of 3dgs, 20.00 dB." in text
+
+
+def test_long_names_of_a_matrix_leave_room_for_the_lines(
+    inputs: ReportInputs, runs: list[ComparedRun]
+) -> None:
+    """Where a legend takes all of it, matplotlib warns, which is an error here."""
+    names = [f"coarse.iterations = {n}, coarse.max_gaussians = {m}" for n in (150, 300) for m in (20, 40)]
+    many = [replace(runs[0], name=name) for name in names]
+    page = Page(build_run_comparison(inputs.sequence, many, views=1))
+    tables = [lines(link) for link in page.links if link.startswith("data:")]
+    (views,) = [table for table in tables if "frame" in table[0]]
+    assert set(views[0]) == {"frame", *names}
