@@ -10,11 +10,11 @@ from extrags.config import PipelineConfig
 from extrags.cores import usable_cores
 from extrags.errors import ConfigError, DamagedArtefactError
 from extrags.memory_estimate import FrameSize, MemoryEstimate, estimate_memory, fitting_settings
-from extrags.stages import StageName, stages_until
+from extrags.stages import STAGES, StageName, stages_until
 from flows.cached_stages import CachedStages
 from flows.estimate import expected_seconds, without_kernels_in_words
 from flows.runners import NotInStoreError
-from flows.workloads import frames_work
+from flows.workloads import frames_stages, frames_work
 from tasks.progress import duration_text, observed
 
 __all__ = ["check_memory", "made_stages"]
@@ -50,9 +50,7 @@ def check_memory(
     """
     size = FrameSize(int(counts["frames"]), int(counts["train"]), int(counts["width"]), int(counts["height"]))
     threads = usable_cores()
-    given = {stage for stage in ("poses", "depth") if counts.get(f"has_{stage}")}
-    given -= {"poses"} if config.poses.replace_given else set()
-    leave_out = {*leave_out, *given}
+    leave_out = set(STAGES).difference(frames_stages(counts, config, leave_out))
     found = estimate_memory(config, size, threads=threads, until=until, leave_out=leave_out)
     to_make: dict[StageName, int] = {
         stage: needed for stage, needed in found.by_stage.items() if stage not in made

@@ -17,6 +17,7 @@ from extrags.stages import StageName
 from flows.cases import SequenceCase
 from flows.expectation import Expectation, expected_words
 from flows.memory_limit import check_memory
+from flows.methods import METHODS, method_config
 from flows.runners import DirectRunner
 from flows.wiring import run_sequence
 from tests.flows.tiny import SEQUENCE, tiny_config
@@ -62,6 +63,18 @@ def test_stages_that_do_not_run_take_no_time(caplog: pytest.LogCaptureFixture) -
     assert whole > minutes(COUNTS, "report", "finetune")
     more = {**COUNTS, "frames": 400, "train": 200, "test": 200}
     assert minutes({**more, "has_depth": False}, "depth") > minutes(more, "depth")
+
+
+@pytest.mark.parametrize(
+    ("method", "settings"), [("3dgs", {}), ("uc-nerf", {}), ("coarse", {"depth.enabled": False})], ids=str
+)
+def test_a_stage_that_the_settings_do_without_needs_no_memory(method: str, settings: dict[str, Any]) -> None:
+    many = {"frames": 1000, "train": 900, "test": 100, "width": 1920, "height": 1080, "has_poses": True}
+    config, leave_out = method_config(method, "balanced", settings), METHODS[method].leave_out
+    found = check_memory("a/b", config, many, 6.5, "coarse", leave_out)
+    assert list(found.by_stage) == ["ingest", "coarse"]
+    with pytest.raises(ConfigError, match=r"in depth, more than the limit of 6\.5 GB"):
+        check_memory("a/b", method_config("coarse", "balanced"), many, 6.5, "coarse", ())
 
 
 def test_a_run_over_the_limit_is_refused_with_settings_that_fit() -> None:
