@@ -30,6 +30,7 @@ def check_memory(
     until: StageName,
     leave_out: Collection[str],
     made: Collection[str] = (),
+    pinned: Collection[str] = (),
 ) -> MemoryEstimate:
     """State what memory and time a run will need, and refuse one that needs more memory than it may.
 
@@ -44,6 +45,7 @@ def check_memory(
         until: last stage.
         leave_out: stages that the method leaves out.
         made: stages that are in the store: they need neither memory nor time.
+        pinned: settings that the method sets itself, which nobody is advised to set.
 
     Raises:
         ConfigError: when the estimate exceeds the limit; names settings that fit.
@@ -65,11 +67,16 @@ def check_memory(
     log.info("%s, and about %s of processor time%s", what, duration_text(seconds), without_kernels_in_words())
     if limit_gb is None or found.peak_gb <= limit_gb:
         return found
-    settings = fitting_settings(config, size, limit_gb, threads=threads, until=until, leave_out=leave_out)
+    settings = fitting_settings(
+        config, size, limit_gb, threads=threads, until=until, leave_out=leave_out, fixed=pinned
+    )
     if settings is None:
         advice = "no smaller frames or fewer virtual views were found that fit"
     else:
         advice = "it fits with " + " ".join(f"--{key} {value}" for key, value in settings.items())
+        if "ingest.width" in settings and config.ingest.downscale is not None:
+            # The width takes the place of the divisor.
+            advice += " --ingest.downscale none"
     raise ConfigError(f"{what}, more than the limit of {limit_gb:g} GB; {advice}")
 
 
