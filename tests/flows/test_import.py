@@ -100,6 +100,19 @@ def test_a_plan_knows_what_it_makes_of_the_settings(finished: Finished, theirs: 
     assert "coarse" not in stages
 
 
+def test_what_a_kept_scene_costs_is_not_known(
+    theirs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = ["plan", SEQUENCE, *config_arguments(), "--store", str(tmp_path), "--imported.scene", str(theirs)]
+    assert main([*given, "--json", "-"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    for prediction in (found["predicted"], found["without_plan"]):
+        assert "finetune" in prediction["unknown"]
+        assert not {"coarse", "finetune"}.intersection(row["stage"] for row in prediction["stages"])
+    assert main([*given, "--before", "--json", "-"]) == 0
+    assert "finetune" in json.loads(capsys.readouterr().out)["predicted"]["unknown"]
+
+
 def test_another_unit_fails_the_stage_and_says_so(finished: Finished, theirs: Path) -> None:
     outcome = imported(finished[0], theirs, imported__scale=0.001)
     assert outcome.status == "failed"
