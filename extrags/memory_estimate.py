@@ -218,6 +218,7 @@ def fitting_settings(
     threads: int = 2,
     until: StageName = "report",
     leave_out: Collection[str] = (),
+    fixed: Collection[str] = (),
 ) -> dict[str, int] | None:
     """Settings that bring a run below a limit, those that cost least quality first.
 
@@ -232,6 +233,7 @@ def fitting_settings(
         threads: as `estimate_memory`.
         until: as `estimate_memory`.
         leave_out: as `estimate_memory`.
+        fixed: settings that are to stay as they are.
 
     Returns:
         Dotted names and values; empty where nothing has to change, None where nothing that is tried helps.
@@ -265,7 +267,7 @@ def fitting_settings(
         "ingest.width": (size.width, [size.width * part // 4 for part in (3, 2, 1)]),
     }
     for name, (now, values) in ways.items():
-        for value in values:
+        for value in values if name not in fixed else ():
             if not SMALLEST_WIDTH <= value < now:
                 continue
             changed[name] = value

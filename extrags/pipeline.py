@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 from extrags.config import PipelineConfig
 from extrags.errors import ConfigError
-from extrags.stages import REGISTRY, StageName, leading_to, stage_named, stages_until
+from extrags.stages import REGISTRY, STAGES, StageName, leading_to, stage_named, stages_until
 
 if TYPE_CHECKING:
     from extrags.scene_plan import Decision, ScenePlan
@@ -27,6 +27,7 @@ __all__ = [
     "NO_GAUSSIANS",
     "Pipeline",
     "needs_plan",
+    "stages_that_can_run",
 ]
 
 log = logging.getLogger(__name__)
@@ -115,7 +116,7 @@ class Pipeline(ABC):
             unused = self.config.poses.working_distance_mm is not None
             return "the source has poses" + ("; poses.working_distance_mm is of no use" if unused else "")
         if stage == "depth":
-            return self._reason_to_skip_depth()
+            return _reason_to_skip_depth(self.config, self.has_depth(), self.training_frame_count())
         if stage == "enhance" and self.virtual_views() == 0:
             return "exploration found no view that adds anything"
         if stage == "evaluate" and self.held_out_frames() == 0:
@@ -123,17 +124,6 @@ class Pipeline(ABC):
             if without_pose:
                 return f"no pose was found for any of the {without_pose} held-out frames"
             return "the sequence has no held-out frames"
-        return None
-
-    def _reason_to_skip_depth(self) -> str | None:
-        if self.has_depth():
-            return "the source has depth"
-        if self.config.uc_nerf.enabled:
-            return "the radiance field has a stereo of its own"
-        if not self.config.depth.enabled:
-            return "the settings do without it (depth.enabled)"
-        if self.training_frame_count() < 2:
-            return "a single training frame has no other to be matched with"
         return None
 
     def planned(self, stage: str) -> Decision | None:
@@ -225,3 +215,57 @@ def needs_plan(leave_out: Collection[str]) -> bool:
     sets are the budgets of exploration and of what follows it.
     """
     return not leave_out or not {"assess", *leading_to("explore")}.intersection(leave_out)
+
+
+def stages_that_can_run(
+    config: PipelineConfig,
+    leave_out: Collection[str],
+    *,
+    has_poses: bool,
+    has_depth: bool,
+    train: float,
+    test: float,
+) -> set[StageName]:
+    """The stages that a run with these settings goes through, as far as its source tells.
+
+    The rules are those of `Pipeline.reason_to_skip`; the plan, and an exploration that finds nothing, may
+    skip more. An imported scene is read in the place of `coarse`, which is not among them: nothing is
+    optimised.
+
+    Args:
+        config: settings of all stages.
+        leave_out: stages that the method leaves out.
+        has_poses: whether the source has camera poses.
+        has_depth: whether it has depth of training frames.
+        train: number of training frames.
+        test: number of held-out frames.
+    """
+    skipped: set[str] = set(leave_out)
+    if not needs_plan(leave_out):
+        skipped.add("assess")
+    if has_poses and not config.poses.replace_given:
+        skipped.add("poses")
+    if _reason_to_skip_depth(config, has_depth, train) is not None:
+        skipped.add("depth")
+    if test == 0:
+        skipped.add("evaluate")
+    for stage in REGISTRY:
+        if stage.needs in skipped or (stage.needs_gaussians and config.uc_nerf.enabled):
+            skipped.add(stage.name)
+    if leave_out and "enhance" not in leave_out and "enhance" in skipped:
+        skipped.add("finetune")
+    if config.imported.scene is not None:
+        skipped.add("coarse")
+    return set(STAGES).difference(skipped)
+
+
+def _reason_to_skip_depth(config: PipelineConfig, has_depth: bool, train: float) -> str | None:
+    if has_depth:
+        return "the source has depth"
+    if config.uc_nerf.enabled:
+        return "the radiance field has a stereo of its own"
+    if not config.depth.enabled:
+        return "the settings do without it (depth.enabled)"
+    if train < 2:
+        return "a single training frame has no other to be matched with"
+    return None

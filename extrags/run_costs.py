@@ -107,6 +107,7 @@ WORKLOAD_SETTINGS = (
     "poses.max_width",
     "poses.n_features",
     "poses.sequential_overlap",
+    "uc_nerf.enabled",
 )
 """All settings that predicted costs depend on: those that `Workload` reads, and those that say which tasks
 run and whether the coefficients hold of them. Without one of these, predictions are of other settings."""
@@ -364,6 +365,9 @@ def beyond_the_fit(task: str, config: PipelineConfig) -> tuple[str, ...]:
     # A restorer that was trained may have been found to be best with more steps.
     elif task == "enhance-train" or (restores and enhance.steps == "auto"):
         found += [f"enhance.train_iterations={enhance.train_iterations}"] * (enhance.train_iterations > 0)
+    if task in ("coarse", "evaluate-render") and config.uc_nerf.enabled:
+        # The radiance field's own tasks run in their place.
+        found.append("uc_nerf.enabled=true")
     if task == "poses" and config.poses.fallback == "rgbd":
         found.append("poses.fallback=rgbd")
     if task == "depth" and config.depth.monocular is not None:

@@ -30,7 +30,7 @@ from flows.history import (
 )
 from flows.leases import run_lease
 from flows.limits import DEFAULT_LIMITS, StageLimits
-from flows.methods import METHODS, MethodName, method_config
+from flows.methods import METHODS, MethodName, method_config, pinned_settings
 from flows.outcome import NOT_COUNTED, SequenceOutcome
 from flows.pages import benchmark_page, image_size
 from flows.parameters import Sequences, Settings, StoreRoot, Variants
@@ -374,6 +374,7 @@ def run_method(
         until="evaluate",
         leave_out=METHODS[base].leave_out or None,
         memory_limit_gb=memory_limit_gb,
+        pinned=pinned_settings(base),
     )
     # Seeds are repetitions of the same: their means are compared over time.
     size = image_size(outcome, Store(store)) if outcome.refs else None

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import takewhile
 from statistics import median
 
 from data_catalog.names import comparable_name
-from extrags.config import PipelineConfig
-from extrags.errors import ExtragsError
+from extrags.config import IngestConfig, PipelineConfig
+from extrags.errors import ConfigError, ExtragsError
+from extrags.pipeline import stages_that_can_run
 from extrags.run_costs import Workload
-from extrags.stages import STAGES, StageName, stages_until
+from extrags.stages import StageName, stages_until
 from extrags.store import Store, digest_of
 from flows.cases import SequenceCase
 from flows.estimate import expected_seconds, usual_pace, without_kernels_in_words
 from flows.methods import METHODS
 from flows.outcome_records import OutcomeRecord, outcome_records, record_of, recorded_name
-from flows.workloads import known_work, work_before_reading
+from flows.settings import pipeline_config
+from flows.workloads import usual_work, work_before_reading
 from tasks.progress import duration_text
 
 __all__ = ["Expectation", "expectations", "expected_words", "longest_first"]
@@ -30,7 +34,8 @@ class Expectation:
     Args:
         case: which.
         seconds: expected.
-        measured: whether from an earlier run of its sequence; else from the number and size of its frames.
+        measured: whether from an earlier run of as many frames of its sequence, of the same size; else from
+            the number and size of its frames.
         sized: whether these are known; else they are taken to be those of a phantom.
     """
 
@@ -72,22 +77,26 @@ def expectations(
         if not refresh and own is not None and _is_finished(own, config, until, keys):
             found.append(Expectation(case, 0.0, measured=True))
             continue
-        left_out = METHODS[case.method].leave_out
-        wanted = [stage for stage in stages_until(until) if stage not in left_out]
         earlier = [*([own] if own is not None else []), *by_sequence.get(comparable_name(case.sequence), [])]
-        times = _measured(earlier)
+        work, possible = _work(case, config, earlier)
+        same = [item for item in earlier if work is None or item.get("size") in (None, work.size)]
+        measured = _measured(same)
+        times = {**_measured(earlier), **measured}
         local = _pace(earlier) or pace or usual_pace()
-        work, possible = _work(case.sequence, config, earlier)
         base = expected_seconds(config, work)
+        # What another method does without says nothing of this one.
+        alike = [item for item in earlier if item["method"] == case.method]
         seconds = 0.0
-        for stage in wanted:
+        for stage in stages_until(until):
+            if stage not in possible:
+                continue
             usual = sum(base[stage].values())
             if stage in times:
                 took, expected = times[stage]
                 seconds += took * (usual / expected if expected else 1.0)
-            elif stage in possible and (not times or not _was_skipped(earlier, stage)):
+            elif not times or not _was_skipped(alike, stage):
                 seconds += usual * local
-        found.append(Expectation(case, seconds, measured=bool(times), sized=work is not None))
+        found.append(Expectation(case, seconds, measured=bool(measured), sized=work is not None))
     return found
 
 
@@ -143,7 +152,7 @@ def _measured(records: Sequence[OutcomeRecord]) -> dict[str, tuple[float, float]
 
 
 def _was_skipped(records: Sequence[OutcomeRecord], stage: str) -> bool:
-    """Whether a run of the same sequence left the stage out, and not because one before it had failed."""
+    """Whether one of the runs left the stage out, and not because one before it had failed."""
     return any(
         row["stage"] == stage and row["state"] == "skipped"
         for record in records
@@ -165,15 +174,40 @@ def _pace(records: Sequence[OutcomeRecord]) -> float | None:
 
 
 def _work(
-    sequence: str, config: PipelineConfig, records: Sequence[OutcomeRecord]
-) -> tuple[Workload | None, Collection[str]]:
-    """Size and stages of a sequence as far as they are known before it is read: a path's by its last run."""
-    if known_work(sequence, config) is None:
-        size = next((record["size"] for record in records if record.get("size")), None)
-        if size is not None:
-            return Workload(config=config, **size), STAGES
+    case: SequenceCase, config: PipelineConfig, records: Sequence[OutcomeRecord]
+) -> tuple[Workload | None, Collection[StageName]]:
+    """Size and stages of a sequence as far as they are known before it is read.
+
+    A run with the same settings of `ingest` tells the size best; any other one where the source tells none.
+    """
+    leave_out = METHODS[case.method].leave_out
+    sized = [record for record in records if record.get("size")]
+    work: Workload | None
     try:
-        return work_before_reading(sequence, config, ())
+        work, possible = work_before_reading(case.sequence, config, leave_out)
+        sized = [record for record in sized if _is_read_alike(record, config)]
     except (ExtragsError, OSError):
         # One source that cannot be read, or whose disk has gone, must not stop the others.
-        return None, STAGES
+        work, told = None, usual_work(config)
+        possible = stages_that_can_run(
+            config, leave_out, has_poses=False, has_depth=False, train=told.train, test=told.test
+        )
+    return (Workload(config=config, **sized[0]["size"]) if sized else work), possible
+
+
+def _is_read_alike(record: OutcomeRecord, config: PipelineConfig) -> bool:
+    """Whether a run read its frames with the same settings; records of earlier versions do not tell."""
+    if "settings" not in record:
+        return False
+    given = {**record["settings"], **record["variant"]}
+    own = {name: value for name, value in given.items() if name.startswith("ingest.")}
+    return _ingest_of(record["profile"], json.dumps(own)) == config.ingest
+
+
+@cache
+def _ingest_of(profile: str, settings: str) -> IngestConfig | None:
+    """Of a run on record; no method sets any of it. None where profile or settings are not there any more."""
+    try:
+        return pipeline_config(profile, json.loads(settings)).ingest
+    except ConfigError:
+        return None

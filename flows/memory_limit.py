@@ -10,11 +10,11 @@ from extrags.config import PipelineConfig
 from extrags.cores import usable_cores
 from extrags.errors import ConfigError, DamagedArtefactError
 from extrags.memory_estimate import FrameSize, MemoryEstimate, estimate_memory, fitting_settings
-from extrags.stages import StageName, stages_until
+from extrags.stages import STAGES, StageName, stages_until
 from flows.cached_stages import CachedStages
 from flows.estimate import expected_seconds, without_kernels_in_words
 from flows.runners import NotInStoreError
-from flows.workloads import frames_work
+from flows.workloads import frames_stages, frames_work
 from tasks.progress import duration_text, observed
 
 __all__ = ["check_memory", "made_stages"]
@@ -30,6 +30,7 @@ def check_memory(
     until: StageName,
     leave_out: Collection[str],
     made: Collection[str] = (),
+    pinned: Collection[str] = (),
 ) -> MemoryEstimate:
     """State what memory and time a run will need, and refuse one that needs more memory than it may.
 
@@ -44,15 +45,14 @@ def check_memory(
         until: last stage.
         leave_out: stages that the method leaves out.
         made: stages that are in the store: they need neither memory nor time.
+        pinned: settings that the method sets itself, which nobody is advised to set.
 
     Raises:
         ConfigError: when the estimate exceeds the limit; names settings that fit.
     """
     size = FrameSize(int(counts["frames"]), int(counts["train"]), int(counts["width"]), int(counts["height"]))
     threads = usable_cores()
-    given = {stage for stage in ("poses", "depth") if counts.get(f"has_{stage}")}
-    given -= {"poses"} if config.poses.replace_given else set()
-    leave_out = {*leave_out, *given}
+    leave_out = set(STAGES).difference(frames_stages(counts, config, leave_out))
     found = estimate_memory(config, size, threads=threads, until=until, leave_out=leave_out)
     to_make: dict[StageName, int] = {
         stage: needed for stage, needed in found.by_stage.items() if stage not in made
@@ -67,11 +67,16 @@ def check_memory(
     log.info("%s, and about %s of processor time%s", what, duration_text(seconds), without_kernels_in_words())
     if limit_gb is None or found.peak_gb <= limit_gb:
         return found
-    settings = fitting_settings(config, size, limit_gb, threads=threads, until=until, leave_out=leave_out)
+    settings = fitting_settings(
+        config, size, limit_gb, threads=threads, until=until, leave_out=leave_out, fixed=pinned
+    )
     if settings is None:
         advice = "no smaller frames or fewer virtual views were found that fit"
     else:
         advice = "it fits with " + " ".join(f"--{key} {value}" for key, value in settings.items())
+        if "ingest.width" in settings and config.ingest.downscale is not None:
+            # The width takes the place of the divisor.
+            advice += " --ingest.downscale none"
     raise ConfigError(f"{what}, more than the limit of {limit_gb:g} GB; {advice}")
 
 

@@ -19,10 +19,10 @@ from extrags.run_costs import (
     stage_tasks,
 )
 from extrags.scene_plan import ScenePlan
-from extrags.stages import REGISTRY, STAGES, cost_of, modelled_tasks
+from extrags.stages import REGISTRY, STAGES, StageName, cost_of, modelled_tasks
 from extrags.store import Manifest, Store
 from flows.outcome import SequenceOutcome
-from flows.workloads import frames_work, task_repeats
+from flows.workloads import frames_stages, frames_work, task_repeats
 
 __all__ = [
     "Pace",
@@ -211,7 +211,9 @@ def predict_run(
     return RunPrediction(found, pace.source, pace.records, unknown)
 
 
-def planned_work(store: Store, outcome: SequenceOutcome, config: PipelineConfig) -> tuple[Workload, set[str]]:
+def planned_work(
+    store: Store, outcome: SequenceOutcome, config: PipelineConfig
+) -> tuple[Workload, set[StageName]]:
     """Size and settings of a sequence that has been read and assessed, and the stages that will run.
 
     Args:
@@ -225,20 +227,28 @@ def planned_work(store: Store, outcome: SequenceOutcome, config: PipelineConfig)
     skipped = {row.stage for row in outcome.stages if row.state == "skipped"}
     # Its row says that it ran: the scene was read, and nothing was trained.
     skipped |= set() if config.imported.scene is None else {"coarse"}
+    counts = store.manifest(outcome.refs["ingest"]).counts
+    coarse = store.manifest(outcome.refs["coarse"]).counts if "coarse" in outcome.refs else None
+    # Rows tell of the stages that have run, the rules of those to come.
+    possible = {*frames_stages(counts, config), *(row.stage for row in outcome.stages)}
+    if config.imported.scene is not None and coarse is not None:
+        # Here, because this loads Prefect.
+        from flows.imported import of_imported_scene
+
+        config = of_imported_scene(config, coarse)
     if outcome.plan is not None:
         decided = ScenePlan.model_validate(
             {name: outcome.plan[name] for name in ScenePlan.model_fields if name in outcome.plan}
         )
         config = decided.applied_to(config)
         skipped |= {line.stage for line in decided.decisions if not line.run}
-    coarse = store.manifest(outcome.refs["coarse"]).counts if "coarse" in outcome.refs else None
-    work = frames_work(store.manifest(outcome.refs["ingest"]).counts, config, coarse)
-    return work, {str(stage) for stage in STAGES if stage not in skipped}
+    wanted = possible - skipped
+    return frames_work(counts, config, coarse), {stage for stage in STAGES if stage in wanted}
 
 
 def unplanned_work(
     store: Store, outcome: SequenceOutcome, config: PipelineConfig
-) -> tuple[Workload, set[str]]:
+) -> tuple[Workload, set[StageName]]:
     """As `planned_work`, of a run without a plan: all stages with the whole of their budgets.
 
     Raises:
@@ -358,6 +368,8 @@ def _config(line: list[Manifest], fallback: PipelineConfig) -> PipelineConfig:
             if isinstance(settings, dict) and group not in changed:
                 known = type(getattr(fallback, group)).model_fields
                 changed[group] = {name: value for name, value in settings.items() if name in known}
+    # A scene says what it is by the task that made it, not by a setting.
+    changed["uc_nerf"] = {"enabled": any(item.stage == "uc-nerf" for item in line)}
     # Of the restorer, others hold no more than what they read themselves.
     restorer = next((item.config.get("config") for item in line if item.stage == "enhance-train"), None)
     settings = restorer if isinstance(restorer, dict) else {"backend": "embedded", "train_iterations": 0}

@@ -18,7 +18,7 @@ from extrags.store.runs import file_killed, sweep_unreadable
 from flows.cases import SequenceCase, record_outcome_quietly
 from flows.leases import is_inner_run, run_lease
 from flows.limits import DEFAULT_LIMITS, StageLimits
-from flows.methods import METHODS, MethodName, profile_label
+from flows.methods import METHODS, MethodName, pinned_settings, profile_label
 from flows.outcome import SequenceFailedError, SequenceOutcome, failed_outcome
 from flows.parameters import Settings, StoreRoot
 from flows.preflight import preflight
@@ -92,6 +92,7 @@ def reconstruct_sequence(
             until=until,
             leave_out=METHODS[method].leave_out,
             memory_limit_gb=limits.memory_gb,
+            pinned=pinned_settings(method),
         )
         record_outcome_quietly(Store(store), case, outcome, until, config)
         # Of workers that died while others went on.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -67,6 +67,7 @@ def run_sequence(
     until: StageName = "report",
     leave_out: Mapping[str, str] | None = None,
     memory_limit_gb: float | None = None,
+    pinned: Collection[str] = (),
 ) -> SequenceOutcome:
     """Run all stages of one sequence.
 
@@ -82,6 +83,7 @@ def run_sequence(
         until: last stage to run.
         leave_out: see `extrags.pipeline.Pipeline`.
         memory_limit_gb: see `flows.memory_limit.check_memory`.
+        pinned: settings that the method sets itself (`flows.methods.pinned_settings`); see there, too.
 
     Raises:
         NotInStoreError: from a runner that only looks.
@@ -93,7 +95,9 @@ def run_sequence(
         if limit is not None and not getattr(runner, "refresh", False):
             look = StoreRunner(store)
             made = made_stages(SequenceRun(name, config, store, look, leave_out=leave_out), until)
-        run.check_frames = lambda told: check_memory(name, config, told, limit, until, run.leave_out, made)
+        run.check_frames = lambda told: check_memory(
+            name, config, told, limit, until, run.leave_out, made, pinned
+        )
     return run.run(until)
 
 

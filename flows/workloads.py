@@ -9,13 +9,15 @@ from typing import Any
 from data_catalog import Descriptor, Glance, describe, glance
 from extrags.config import PipelineConfig
 from extrags.errors import ExtragsError
+from extrags.pipeline import stages_that_can_run
 from extrags.run_costs import Workload
-from extrags.stages import STAGES, Repeats, modelled_tasks
+from extrags.stages import Repeats, StageName, modelled_tasks
 
 __all__ = [
     "at_detail_size",
     "detail_flags",
     "expected_work",
+    "frames_stages",
     "frames_work",
     "known_work",
     "read_size",
@@ -69,6 +71,23 @@ def frames_work(
     return Workload(width * height, frames, train, test, config, width=width, coarse_gaussians=gaussians)
 
 
+def frames_stages(
+    counts: Mapping[str, Any], config: PipelineConfig, leave_out: Collection[str] = ()
+) -> set[StageName]:
+    """The stages that can run of a sequence that has been read (`extrags.pipeline.stages_that_can_run`).
+
+    Args:
+        counts: of the artefact of its `ingest`.
+        config: settings of all stages.
+        leave_out: stages that the method leaves out.
+    """
+    has_poses, has_depth = (bool(counts.get(name)) for name in ("has_poses", "has_depth"))
+    train, test = (float(counts[name] or 0) for name in ("train", "test"))
+    return stages_that_can_run(
+        config, leave_out, has_poses=has_poses, has_depth=has_depth, train=train, test=test
+    )
+
+
 def at_detail_size(work: Workload, counts: Mapping[str, Any]) -> Workload | None:
     """The same run with frames of the size that keeps their detail; None where that is the size they have.
 
@@ -102,17 +121,20 @@ def detail_flags(config: PipelineConfig, counts: Mapping[str, Any]) -> str:
 
 def work_before_reading(
     name: str, config: PipelineConfig, leave_out: Collection[str]
-) -> tuple[Workload, set[str]]:
+) -> tuple[Workload, set[StageName]]:
     """Size and settings of a sequence that has not been read, and the stages that may run.
 
     How many frames are held out is not in the catalogue: half of them are taken to be. Of folders and footage
-    names and headers tell; of footage, how many frames there will be at most. All stages are taken to run.
+    names and headers tell; of footage, how many frames there will be at most. The plan is taken to skip none.
 
     Raises:
         UnknownSequenceError: neither a known name nor an existing path.
         SourceError: a source that cannot be read.
         ConfigError: a size that it cannot give.
     """
+    if config.imported.scene is not None and config.imported.keep:
+        # As `of_imported_scene` does, which knows more once the scene is read.
+        config = config.with_overrides({"finetune.keep_scene": True})
     seen = glance(name, config.ingest)
     about: Glance | Descriptor = describe(name) if seen is None else seen
     if isinstance(about, Descriptor):
@@ -120,11 +142,14 @@ def work_before_reading(
     else:
         counts = {name: getattr(about, name) for name in ("width", "height", "train", "test")}
         work = frames_work({**counts, "frames": about.train + about.test}, config)
-    stages = {str(stage) for stage in STAGES if stage not in leave_out}
-    stages -= {"poses"} if about.has_poses and not config.poses.replace_given else set()
-    stages -= {"depth"} if about.has_depth and not config.ingest.withhold_depth else set()
-    stages -= set() if config.imported.scene is None else {"coarse"}
-    return work, stages
+    return work, stages_that_can_run(
+        config,
+        leave_out,
+        has_poses=about.has_poses,
+        has_depth=about.has_depth and not config.ingest.withhold_depth,
+        train=work.train,
+        test=work.test,
+    )
 
 
 def _catalogue_work(about: Descriptor, config: PipelineConfig) -> Workload:

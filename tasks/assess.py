@@ -27,9 +27,12 @@ _OF_RESTORER = ("enhance.backend", "enhance.judge", "enhance.steps", "enhance.tr
 """Settings that say what will restore the virtual views."""
 
 _OF_SAVINGS = tuple(
-    name for name in WORKLOAD_SETTINGS if name.partition(".")[0] not in ("poses", "depth", "evaluate")
+    name
+    for name in WORKLOAD_SETTINGS
+    if name.partition(".")[0] not in ("poses", "depth", "evaluate", "uc_nerf")
 )
-"""Settings that what a stage costs depends on; nothing is decided on the evaluation, nor on what has run."""
+"""Settings that what a stage costs depends on; nothing is decided on the evaluation, nor on what has run, and
+a radiance field has no plan."""
 
 
 def measuring_settings(config: AssessConfig) -> AssessConfig:

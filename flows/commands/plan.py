@@ -16,6 +16,7 @@ from flows.commands.run import execute
 if TYPE_CHECKING:
     from extrags.config import PipelineConfig
     from extrags.run_costs import Workload
+    from extrags.stages import StageName
     from flows.run_costs import RunPrediction
 
 __all__ = ["add_arguments", "plan", "print_prediction"]
@@ -68,15 +69,17 @@ def plan(given: argparse.Namespace) -> int:
     from flows.workloads import at_detail_size, detail_flags
 
     store, config = Store(store_root(given)), run_config(given)
-    pace = pace_here(store, config, packaged_model())
+    unplanned, unplanned_stages = unplanned_work(store, outcome, config)
+    # With the settings that an imported scene leads to.
+    pace = pace_here(store, unplanned.config, packaged_model())
 
-    def cost(work: Workload, stages: set[str]) -> RunPrediction:
+    def cost(work: Workload, stages: set[StageName]) -> RunPrediction:
         scenes = 2 if "finetune" in stages else 1
         return predict_run(store, work, stages, measured_scenes=scenes, pace=pace)
 
     work, stages = planned_work(store, outcome, config)
     predicted = cost(work, stages)
-    whole = cost(*unplanned_work(store, outcome, config))
+    whole = cost(unplanned, unplanned_stages)
     counts = store.manifest(outcome.refs["ingest"]).counts
     smaller = at_detail_size(work, counts)
     reduced = None if smaller is None else cost(smaller, stages)

@@ -245,6 +245,7 @@ class TestRestorer:
             ),
             ({"enhance.train_iterations": 9, "enhance.steps": 1}, {"enhance-train"}),
             ({"finetune.keep_scene": True}, {"finetune", "finetune-judge"}),
+            ({"uc_nerf.enabled": True}, {"coarse", "evaluate-render"}),
         ],
     )
     def test_what_no_record_tells_of(self, settings: dict[str, object], tasks: set[str]) -> None:

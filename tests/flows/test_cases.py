@@ -9,16 +9,20 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from PIL import Image
 
 from data_catalog.folders import FolderDataset
 from extrags.errors import ConfigError
-from extrags.store import Store, write_record
+from extrags.run_costs import Workload
+from extrags.stages import StageName
+from extrags.store import Store, read_records, write_record
 from extrags.store.records import remove_record
 from extrags.store.runs import recorded_run
 from flows.cases import SequenceCase, cases_of, matrix_points, record_outcome, selected
 from flows.cli import main
 from flows.commands.run_checks import check_names
 from flows.dataset import reconstruct_dataset
+from flows.estimate import expected_seconds
 from flows.expectation import Expectation, expectations, expected_words, longest_first
 from flows.outcome import DatasetFailedError, SequenceOutcome, StageRow
 from flows.outcome_records import outcome_records
@@ -36,6 +40,25 @@ def leave(store: str, of: SequenceCase, *stages: StageRow, status: Any = "ok", u
     """Leave the record of a run."""
     outcome = SequenceOutcome(of.sequence, status, list(stages))
     record_outcome(Store(store), of, outcome, until, of.config())
+
+
+def leave_read(store: str, of: SequenceCase, work: Workload, *more: StageRow) -> None:
+    """Leave the record of a run that read frames and estimated their poses, each in 100 seconds."""
+    rows = [StageRow(stage, "ran", made_seconds=100.0) for stage in ("ingest", "poses")]
+    leave(store, of, *rows, *more, until="depth" if more else "poses")
+    (record,) = read_records(Store(store), of.record).values()
+    expected = expected_seconds(of.config(), work)
+    for row in record["stages"]:
+        row["expected_cpu_s"] = sum(expected[row["stage"]].values())
+    write_record(Store(store), of.record, {**record, "size": work.size})
+
+
+def with_frames(folder: Path, number: int = 9) -> Path:
+    """A folder with so many frames."""
+    folder.mkdir(exist_ok=True)
+    for frame in range(number):
+        Image.new("RGB", (60, 50), (90, 60, 50)).save(folder / f"{frame:03d}.png")
+    return folder
 
 
 def test_a_run_of_an_imported_scene_stands_beside_the_sequence_own() -> None:
@@ -257,6 +280,55 @@ class TestExpected:
         leave(store, folder, read, *spared, StageRow("coarse", "failed"), status="failed")
         (same,) = expectations([folder], store, "surface")
         assert found.seconds == same.seconds < with_depth.seconds
+
+    def test_what_another_method_does_without_is_no_part_of_its_time(self, tmp_path: Path) -> None:
+        own, plain = (
+            SequenceCase(str(with_frames(tmp_path / "frames")), method=method, profile="quick")
+            for method in ("extrags", "3dgs")
+        )
+
+        def seconds(of: SequenceCase, store: str, until: StageName) -> float:
+            return expectations([of], str(tmp_path / store), until, refresh=True)[0].seconds
+
+        work = expected_work(own.sequence, own.config())
+        assert work is not None
+        leave_read(str(tmp_path / "one"), own, work, StageRow("depth", "ran", made_seconds=100.0))
+        assert seconds(own, "one", "depth") == pytest.approx(300.0)
+        assert seconds(plain, "one", "depth") == pytest.approx(200.0)
+        # Nor does what that skips for its settings say that this one does.
+        leave_read(str(tmp_path / "other"), plain, work, StageRow("depth", "skipped"))
+        assert seconds(own, "other", "depth") > seconds(own, "other", "poses")
+
+    def test_a_preview_tells_the_pace_and_not_the_time_of_a_whole_run(self, tmp_path: Path) -> None:
+        store, folder = str(tmp_path / "store"), with_frames(tmp_path / "frames", 40)
+        few, all_of_them = (
+            SequenceCase(str(folder), profile="quick", settings={**TINY, "ingest.max_frames": number})
+            for number in (4, 40)
+        )
+        work = expected_work(few.sequence, few.config())
+        assert work is not None
+        leave_read(store, few, work)
+        (again,) = expectations([few], store, "poses", refresh=True)
+        assert again.measured
+        assert again.seconds == pytest.approx(200.0)
+        (whole,) = expectations([all_of_them], store, "poses")
+        assert not whole.measured
+        assert whole.seconds > 2 * again.seconds
+        assert expected_words([whole]).endswith("; by their frames")
+
+    def test_a_run_with_the_same_settings_tells_the_size_of_frames(self, tmp_path: Path) -> None:
+        """Names and headers tell at most how many frames there will be."""
+        store, folder = str(tmp_path / "store"), with_frames(tmp_path / "frames", 20)
+        leave_read(store, case(str(folder)), Workload(1000, 12, 10, 2, case().config(), width=40))
+        (found,) = expectations([case(str(folder))], store, "poses", refresh=True)
+        assert found.measured
+        assert found.seconds == pytest.approx(200.0)
+        # What cannot be looked at is taken to be what it was.
+        shutil.rmtree(folder)
+        larger = SequenceCase(str(folder), profile="quick", settings={**TINY, "ingest.width": 60})
+        (gone,) = expectations([larger], store, "poses")
+        assert gone.sized
+        assert gone.seconds == pytest.approx(200.0)
 
     def test_a_path_is_measured_in_any_spelling(self, tmp_path: Path) -> None:
         store = str(tmp_path / "store")

@@ -22,6 +22,7 @@ from extrags.errors import ArtefactGoneError, ConfigError, StoreError
 from extrags.stages import STAGES
 from extrags.store import Store
 from flows.dataset import reconstruct_dataset
+from flows.limits import StageLimits
 from flows.outcome import DatasetFailedError, SequenceFailedError, SequenceOutcome
 from flows.outcome_records import outcome_records
 from flows.sequence import open_store, reconstruct_sequence
@@ -70,6 +71,21 @@ class TestSequence:
         assert isinstance(failure, SequenceFailedError)
         assert states(failure.outcome)["ingest"] == "failed"
         assert Store(tmp_path / "store").ls() == []
+
+    def test_a_refusal_advises_nothing_that_the_method_sets(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr("flows.memory_limit.usable_cores", lambda: 2)
+        with pytest.raises(
+            SequenceFailedError, match=r"it fits with --enhance\.max_views \d+ --ingest\.width"
+        ):
+            reconstruct_sequence(
+                sequence=SEQUENCE,
+                method="paper",
+                settings={"ingest.width": 320, "ingest.max_frames": 6},
+                store=str(tmp_path),
+                limits=StageLimits(memory_gb=2.2),
+            )
 
     def test_a_path_has_one_name_on_record(self, tmp_path: Path) -> None:
         (tmp_path / "empty").mkdir()

@@ -20,6 +20,7 @@ from extrags.splat_files import bake_recorded_light, write_compressed_ply, write
 from extrags.store import Store
 from flows.cli import main
 from flows.outcome import SequenceOutcome
+from flows.run_costs import planned_work
 from flows.runners import DirectRunner
 from flows.wiring import run_sequence
 from tests.flows.tiny import SEQUENCE, TINY, tiny_config
@@ -87,6 +88,29 @@ def test_the_file_counts_by_its_content(finished: Finished, theirs: Path, tmp_pa
     write_spz(scene.gaussians.subset(torch.arange(len(scene.gaussians) - 1)), moved)
     other = imported(store, moved)
     assert other.refs["coarse"] != first.refs["coarse"]
+
+
+def test_a_plan_knows_what_it_makes_of_the_settings(finished: Finished, theirs: Path) -> None:
+    """The costs of fine-tuning are those of a scene that is kept as it is."""
+    store, config = Store(finished[0]), config_of(theirs)
+    work, stages = planned_work(store, imported(store.root, theirs), config)
+    assert work.config.finetune.keep_scene
+    assert work.config.coarse.densify.max_gaussians >= config.coarse.densify.max_gaussians
+    assert "finetune" in stages
+    assert "coarse" not in stages
+
+
+def test_what_a_kept_scene_costs_is_not_known(
+    theirs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = ["plan", SEQUENCE, *config_arguments(), "--store", str(tmp_path), "--imported.scene", str(theirs)]
+    assert main([*given, "--json", "-"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    for prediction in (found["predicted"], found["without_plan"]):
+        assert "finetune" in prediction["unknown"]
+        assert not {"coarse", "finetune"}.intersection(row["stage"] for row in prediction["stages"])
+    assert main([*given, "--before", "--json", "-"]) == 0
+    assert "finetune" in json.loads(capsys.readouterr().out)["predicted"]["unknown"]
 
 
 def test_another_unit_fails_the_stage_and_says_so(finished: Finished, theirs: Path) -> None:

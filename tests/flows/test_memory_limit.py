@@ -14,9 +14,11 @@ import pytest
 from extrags.config import profile_config
 from extrags.errors import ConfigError
 from extrags.stages import StageName
+from flows.benchmark import run_method
 from flows.cases import SequenceCase
 from flows.expectation import Expectation, expected_words
 from flows.memory_limit import check_memory
+from flows.methods import METHODS, method_config, pinned_settings
 from flows.runners import DirectRunner
 from flows.wiring import run_sequence
 from tests.flows.tiny import SEQUENCE, tiny_config
@@ -64,6 +66,18 @@ def test_stages_that_do_not_run_take_no_time(caplog: pytest.LogCaptureFixture) -
     assert minutes({**more, "has_depth": False}, "depth") > minutes(more, "depth")
 
 
+@pytest.mark.parametrize(
+    ("method", "settings"), [("3dgs", {}), ("uc-nerf", {}), ("coarse", {"depth.enabled": False})], ids=str
+)
+def test_a_stage_that_the_settings_do_without_needs_no_memory(method: str, settings: dict[str, Any]) -> None:
+    many = {"frames": 1000, "train": 900, "test": 100, "width": 1920, "height": 1080, "has_poses": True}
+    config, leave_out = method_config(method, "balanced", settings), METHODS[method].leave_out
+    found = check_memory("a/b", config, many, 6.5, "coarse", leave_out)
+    assert list(found.by_stage) == ["ingest", "coarse"]
+    with pytest.raises(ConfigError, match=r"in depth, more than the limit of 6\.5 GB"):
+        check_memory("a/b", method_config("coarse", "balanced"), many, 6.5, "coarse", ())
+
+
 def test_a_run_over_the_limit_is_refused_with_settings_that_fit() -> None:
     config = profile_config("balanced").with_overrides({"enhance.max_width": None})
     with pytest.raises(
@@ -72,6 +86,50 @@ def test_a_run_over_the_limit_is_refused_with_settings_that_fit() -> None:
         check_memory("a/b", config, COUNTS, 6.0, "report", ())
     with pytest.raises(ConfigError, match="no smaller frames or fewer virtual views were found"):
         check_memory("a/b", config, COUNTS, 0.1, "report", ())
+
+
+@pytest.fixture
+def two_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("flows.memory_limit.usable_cores", lambda: 2)
+
+
+@pytest.mark.usefixtures("two_cores")
+def test_what_is_advised_is_not_refused_for_a_divisor_of_the_size() -> None:
+    config = profile_config("balanced").with_overrides({"ingest.downscale": 1})
+    with pytest.raises(ConfigError, match=r"--ingest\.width \d+ --ingest\.downscale none$"):
+        check_memory("a/b", config, COUNTS, 2.5, "report", ())
+    # Frames need not be smaller.
+    with pytest.raises(ConfigError, match=r"it fits with --enhance\.max_width \d+$"):
+        check_memory("a/b", config.with_overrides({"enhance.max_width": None}), COUNTS, 6.0, "report", ())
+
+
+@pytest.mark.usefixtures("two_cores")
+@pytest.mark.parametrize("method", ["paper", "exploregs"])
+def test_no_setting_is_advised_that_the_method_sets_itself(method: str) -> None:
+    config, leave_out = method_config(method, "balanced"), METHODS[method].leave_out
+    pinned = pinned_settings(method)
+    with pytest.raises(ConfigError, match=r"it fits with --enhance\.max_width"):
+        check_memory("a/b", config, COUNTS, 6.0, "report", leave_out)
+    with pytest.raises(ConfigError, match="it fits with") as refused:
+        check_memory("a/b", config, COUNTS, 6.0, "report", leave_out, pinned=pinned)
+    advised = re.findall(r"--(\S+)", str(refused.value))
+    assert advised
+    assert not pinned.intersection(advised)
+
+
+def test_runs_say_what_their_method_sets(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    told: list[object] = []
+
+    def refused(*given: object) -> None:
+        told.append(given[-1])
+        raise ConfigError("too much")
+
+    monkeypatch.setattr("flows.wiring.check_memory", refused)
+    store = str(tmp_path)
+    runner = DirectRunner(store)
+    run_sequence(SEQUENCE, tiny_config(), store, runner, pinned=("a.b",))
+    run_method("paper", SEQUENCE, "quick", 0, {"ingest.max_frames": 4}, store, runner)
+    assert told == [("a.b",), pinned_settings("paper")]
 
 
 def test_nothing_but_ingest_is_made_of_a_refused_sequence(tmp_path: Path) -> None:

@@ -13,7 +13,9 @@ from extrags.run_costs import CostModel, Workload, packaged_model
 from extrags.store import Store
 from flows import run_costs
 from flows.commands.plan import print_prediction
-from flows.run_costs import RunPrediction, predict_run, recorded_costs
+from flows.methods import METHODS, method_config
+from flows.outcome import SequenceOutcome, StageRow
+from flows.run_costs import RunPrediction, planned_work, predict_run, recorded_costs
 from flows.runners import DirectRunner
 from flows.wiring import run_sequence
 from flows.workloads import expected_work, work_before_reading
@@ -77,6 +79,9 @@ def test_what_a_backend_takes_is_unknown_without_records_of_it(
     assert [row.stage for row in classical.stages] == ["coarse", "finetune", "evaluate"]
     assert predicted(enhance__train_iterations=9, enhance__steps=1).unknown == ["enhance-train"]
     assert predicted(finetune__keep_scene=True).unknown == ["finetune"]
+    # A radiance field stands in the place of the scene, and of its renders.
+    field = predicted({"coarse", "evaluate"}, uc_nerf__enabled=True)
+    assert field.unknown == ["coarse", "evaluate-render"]
     # Where nothing is restored, a backend is neither here nor there.
     assert predicted(stages - {"enhance"}, enhance__backend="classical").unknown == []
 
@@ -95,6 +100,14 @@ def test_the_restorer_of_a_record_is_the_one_it_was_made_with(filled: Store) -> 
     assert pace["enhance"] == pytest.approx(pace["evaluate"])
     assert other["enhance"] != pace["enhance"]
     assert "evaluate-restore" not in other
+
+
+def test_records_of_gaussians_tell_nothing_of_a_radiance_field(filled: Store) -> None:
+    config = UNTRAINED.with_overrides({"uc_nerf.enabled": True})
+    _, processor = recorded_costs(filled, config)
+    pace = packaged_model().pace(processor, config)
+    assert "coarse" not in pace
+    assert "ingest" in pace
 
 
 def test_without_history_a_probe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -124,6 +137,17 @@ def test_without_kernels_what_renders_is_at_the_pace_of_another_rasteriser(
     )
 
 
+class TestPlannedWork:
+    def test_a_radiance_field_is_not_explored(self, filled: Store) -> None:
+        (read,) = filled.ls("ingest*")
+        found = filled.find(read.key)
+        assert found is not None
+        rows = [StageRow(stage, "skipped") for stage in ("poses", "depth", "assess")]
+        outcome = SequenceOutcome(SEQUENCE, stages=rows, refs={"ingest": found})
+        config = CONFIG.with_overrides({"uc_nerf.enabled": True})
+        assert planned_work(filled, outcome, config)[1] == {"ingest", "coarse", "evaluate", "report"}
+
+
 class TestWorkBeforeReading:
     def test_of_a_path_names_and_headers_tell(self, tmp_path: Path) -> None:
         for number in range(9):
@@ -135,6 +159,23 @@ class TestWorkBeforeReading:
         assert (work.frames, work.train, work.test) == (9, 7, 2)
         assert "poses" in stages
         assert "depth" not in stages
+
+    def test_stages_that_the_settings_do_without_are_not_among_them(self, tmp_path: Path) -> None:
+        for number in range(9):
+            Image.new("RGB", (60, 50), (90, 60, 50)).save(tmp_path / f"{number}.png")
+        plain, leave_out = method_config("3dgs", "quick"), METHODS["3dgs"].leave_out
+        _, stages = work_before_reading(str(tmp_path), plain, leave_out)
+        assert stages == {"ingest", "poses", "coarse", "evaluate", "report"}
+        _, stages = work_before_reading(str(tmp_path), CONFIG, ())
+        assert {"depth", "assess", "finetune"} <= stages
+
+    @pytest.mark.parametrize("keep", [True, False])
+    def test_an_imported_scene_is_kept_where_it_is_to_be(self, keep: bool) -> None:
+        config = CONFIG.with_overrides({"imported.scene": "their.ply", "imported.keep": keep})
+        work, stages = work_before_reading(SEQUENCE, config, ())
+        assert work.config.finetune.keep_scene is keep
+        assert "coarse" not in stages
+        assert not work_before_reading(SEQUENCE, CONFIG, ())[0].config.finetune.keep_scene
 
     def test_a_wrong_source_is_refused(self, tmp_path: Path) -> None:
         with pytest.raises(SourceNotFoundError, match="the folder is empty"):

@@ -17,7 +17,11 @@ OF_DECISIONS = {
     "assess.full_budget_share",
     "assess.min_hole_share",
     "explore.length",
-    *(name for name in WORKLOAD_SETTINGS if not name.startswith(("poses.", "depth.", "evaluate."))),
+    *(
+        name
+        for name in WORKLOAD_SETTINGS
+        if not name.startswith(("poses.", "depth.", "evaluate.", "uc_nerf."))
+    ),
 }
 """Settings that a plan depends on: by what is decided, or by what that saves."""
 
