@@ -93,7 +93,9 @@ def test_logs_do_not_tell() -> None:
 
 def test_settings_with_credentials_are_refused() -> None:
     url = f"https://user:{SECRET}@hub/model"
-    said = r"setting enhance\.pretrained\.model is 'https://\*\*\*@hub/model'; it holds a password, key or token"
+    said = (
+        r"setting enhance\.pretrained\.model is 'https://\*\*\*@hub/model'; it holds a password, key or token"
+    )
     with pytest.raises(ConfigError, match=said) as refused:
         PipelineConfig().with_overrides({"enhance.pretrained.model": url})
     with pytest.raises(ValidationError) as invalid:
