@@ -236,6 +236,12 @@ def test_lists_and_variants() -> None:
         "dim": {"method": "3dgs", "coarse.iterations": 5},
         "x": {"coarse.light.enabled": False},
     }
+    words = ["enhance.max_width=none", "evaluate.lpips_nets=alex"]
+    assert parsed_variants([["whole", "extrags", *words]])["whole"] == {
+        "method": "extrags",
+        "enhance.max_width": None,
+        "evaluate.lpips_nets": ("alex",),
+    }
     for wrong in ([["a", "b", "c", "x.y=1"]], [["a=1"]], [["a", "x.y=1"], ["a", "x.y=2"]]):
         with pytest.raises(ConfigError, match="--variant a"):
             parsed_variants(wrong)
