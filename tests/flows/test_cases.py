@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -38,11 +39,36 @@ def leave(store: str, of: SequenceCase, *stages: StageRow, status: Any = "ok", u
     record_outcome(Store(store), of, outcome, until, of.config())
 
 
-def test_a_run_of_an_imported_scene_stands_beside_the_sequence_own() -> None:
+def test_a_run_of_an_imported_scene_stands_beside_the_sequence_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
     own, imported = case(), SequenceCase(SEQUENCE, profile="quick", settings={"imported.scene": "their.ply"})
     assert own.record != imported.record
     assert own.record == SequenceCase(SEQUENCE, profile="quick").record
-    assert imported.distinguishing == {"imported.scene": "their.ply"}
+    assert imported.distinguishing == {"imported.scene": str(tmp_path / "their.ply")}
+
+
+def test_one_imported_scene_is_one_run_however_its_file_is_spelled(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    settings, file = {**TINY, "imported.scene": "their.ply"}, str(tmp_path / "their.ply")
+    relative = SequenceCase(SEQUENCE, profile="quick", settings=settings)
+    full = replace(relative, settings={**settings, "imported.scene": file})
+    varied = replace(relative, settings=TINY, changed={"imported.scene": "./their.ply"})
+    assert relative.record == full.record == varied.record
+    # Its page as well, which shows all settings.
+    assert relative.config() == full.config() == varied.config()
+    assert full.former_record == full.record
+    # What earlier versions left under the path as it was written goes.
+    store = Store(tmp_path / "store")
+    leave(store.root, full, StageRow("report", "ran"), until="report")
+    (record,) = outcome_records(store).values()
+    remove_record(store, full.record)
+    write_record(store, relative.former_record, {**record, "variant": {"imported.scene": "their.ply"}})
+    leave(store.root, relative, StageRow("report", "ran"), until="report")
+    assert list(outcome_records(store)) == [full.record]
 
 
 class TestPaths:
