@@ -1,8 +1,9 @@
 """Credentials taken out of text before it is shown, logged or stored.
 
 Recognised are the user and password of a URL (`s3://KEY:SECRET@bucket`), values of query fields whose names
-speak of keys, tokens, signatures or passwords, HTTP authorisation headers, and the values of environment
-variables that hold such things (`EXTRAGS_CAPTION_KEY`, `AWS_SECRET_ACCESS_KEY`, `HF_TOKEN`, ...).
+speak of keys, tokens, signatures or passwords, HTTP authorisation headers by their name (and `Bearer` before
+what can only be a token), and the values of environment variables that hold such things
+(`EXTRAGS_CAPTION_KEY`, `AWS_SECRET_ACCESS_KEY`, `HF_TOKEN`, ...).
 """
 
 from __future__ import annotations
@@ -27,7 +28,18 @@ _QUERY = re.compile(
     r"""[^=&;\s"'<>]{0,64}=)[^&;\s"'<>#]+""",
     re.IGNORECASE,
 )
-_HEADER = re.compile(r"(?P<name>\b(?:bearer|basic)\s+)[A-Za-z0-9+/_.~=-]{12,}", re.IGNORECASE)
+# `basic` and `bearer` are words, and folders are called `basic colonoscopies`: they count behind the name of
+# the header, and where `http.client` refuses one (`Invalid header value b'Bearer ...'`).
+_HEADER = re.compile(
+    r"""(?P<name>(?:authorization["']?\s*[:=,]|\bheader\s+value:?)\s*b?["']?(?:bearer|basic)\s+)"""
+    r"""[A-Za-z0-9+/_.~=-]{12,}""",
+    re.IGNORECASE,
+)
+# Elsewhere a long text of digits and both cases before any slash is a token, behind the rarer word.
+_BEARER = re.compile(
+    r"(?P<name>\b(?i:bearer)\s+)(?=[\w+.~=-]*\d)(?=[\w+.~=-]*[a-z])(?=[\w+.~=-]*[A-Z])"
+    r"[A-Za-z0-9+_.~=-]{20,}[A-Za-z0-9+/_.~=-]*"
+)
 _SECRET_VARIABLE = re.compile(
     r"(SECRET|TOKEN|PASSWORD|PASSWD|API_?KEY|ACCESS_KEY|CAPTION_KEY|CREDENTIALS?)", re.IGNORECASE
 )
@@ -44,7 +56,9 @@ def without_credentials(text: str) -> str:
     if "://" in text:
         text = _USER.sub(rf"\g<scheme>{HIDDEN}@", text)
         text = _QUERY.sub(rf"\g<name>{HIDDEN}", text)
-    return _HEADER.sub(rf"\g<name>{HIDDEN}", text)
+    for header in (_HEADER, _BEARER):
+        text = header.sub(rf"\g<name>{HIDDEN}", text)
+    return text
 
 
 def has_credentials(text: str) -> bool:

@@ -8,7 +8,7 @@ from itertools import product
 from typing import Any
 
 from extrags.config import PipelineConfig
-from extrags.config.settings import settings_of, unknown_setting
+from extrags.config.settings import listed_values, settings_of, unknown_setting
 from extrags.errors import ConfigError
 
 __all__ = ["PRESETS", "SET_PRESETS", "Budget", "budgets_of", "parsed_vary", "preset_budgets", "reaching"]
@@ -103,13 +103,16 @@ def parsed_vary(text: str) -> list[dict[str, Any]]:
     """`coarse.iterations=500,1500` to `[{"coarse.iterations": 500}, {"coarse.iterations": 1500}]`.
 
     Settings that change together are joined by `+`; each value is then one for all of them, or one for each,
-    joined by `+` as well: `ingest.width+ingest.height=120+96,160+128`.
+    joined by `+` as well: `ingest.width+ingest.height=120+96,160+128`. Values are written as for the
+    setting's own flag; those that hold commas themselves between brackets:
+    `enhance.channels=[8,8,16],[16,16,32]`.
 
     Raises:
-        ConfigError: for an unknown setting, one without values, or values that do not match the settings.
+        ConfigError: for an unknown setting, one without values, a wrong value, or values that do not match
+            the settings.
     """
     left, separator, right = text.partition("=")
-    names, points = left.split("+"), [point for point in right.split(",") if point]
+    names, points = left.split("+"), [point for point in listed_values(right) if point]
     if not separator or not points:
         raise ConfigError(f"--vary {text}: expected NAME=VALUE,VALUE, e.g. coarse.iterations=500,1500")
     known = settings_of(PipelineConfig)
@@ -123,7 +126,7 @@ def parsed_vary(text: str) -> list[dict[str, Any]]:
             values *= len(names)
         if len(values) != len(names):
             raise ConfigError(f"--vary {text}: {point} has {len(values)} values for {len(names)} settings")
-        found.append({name: _parsed(value) for name, value in zip(names, values, strict=True)})
+        found.append({name: known[name].parse(value) for name, value in zip(names, values, strict=True)})
     return found
 
 
@@ -139,9 +142,3 @@ def reaching(budget: Budget, left_out: Mapping[str, str]) -> dict[str, Any]:
 
 def _budget(settings: Mapping[str, Any]) -> Budget:
     return Budget(", ".join(f"{name}={value}" for name, value in settings.items()), dict(settings))
-
-
-def _parsed(text: str) -> Any:
-    import yaml
-
-    return yaml.safe_load(text)

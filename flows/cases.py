@@ -17,6 +17,7 @@ from extrags.metrics.registry import PROTOCOL_VERSION
 from extrags.stages import STAGES, StageName
 from extrags.store import Store, digest_of, read_records, write_record
 from extrags.store.records import remove_record
+from extrags.user_paths import absolute
 from flows.estimate import expected_seconds
 from flows.methods import METHODS, check_not_pinned, method_config, pinned_settings
 from flows.outcome import SequenceOutcome, StageRow
@@ -38,6 +39,8 @@ __all__ = [
 ]
 
 log = logging.getLogger(__name__)
+
+IMPORTED = "imported.scene"
 
 Only = Literal["failed", "changed", "missing"]
 """Which cases of a run are taken: those whose last run failed; those of which something would be made; those
@@ -73,8 +76,17 @@ class SequenceCase:
 
     @property
     def distinguishing(self) -> dict[str, Any]:
-        """Settings whose runs stand beside each other: those of a matrix, and the scene that is imported."""
-        imported = {name: self.settings[name] for name in ("imported.scene",) if self.settings.get(name)}
+        """Settings whose runs stand beside each other: those of a matrix, and the scene that is imported.
+
+        The scene's path is absolute: a file is one, however and from wherever it is named.
+        """
+        found = self._distinguishing_as_given
+        scene = found.get(IMPORTED)
+        return {**found, IMPORTED: str(absolute(scene))} if scene else found
+
+    @property
+    def _distinguishing_as_given(self) -> dict[str, Any]:
+        imported = {IMPORTED: self.settings[IMPORTED]} if self.settings.get(IMPORTED) else {}
         return {**imported, **self.changed}
 
     @property
@@ -84,20 +96,25 @@ class SequenceCase:
         Other settings that are the same for all runs of a sequence are not part of it: who mends them runs
         the same case again.
         """
-        return self._record_of(path_of(self.sequence) or self.sequence)
+        return self._record_of(path_of(self.sequence) or self.sequence, self.distinguishing)
 
     @property
     def former_record(self) -> str:
-        """What earlier versions called it: with paths as they were written, from whichever folder."""
-        return self._record_of(self.sequence)
+        """What earlier versions called it: with paths as they were written, from whichever folder.
 
-    def _record_of(self, sequence: str) -> str:
+        The path of an imported scene was for longer than that of the sequence.
+        """
+        given = self._distinguishing_as_given
+        place = self.sequence if given == self.distinguishing else path_of(self.sequence)
+        return self._record_of(place or self.sequence, given)
+
+    def _record_of(self, sequence: str, variant: Mapping[str, Any]) -> str:
         told = {
             "sequence": sequence,
             "method": self.method,
             "profile": self.profile,
             "seed": self.seed,
-            "variant": self.distinguishing,
+            "variant": dict(variant),
         }
         return f"{OUTCOME}{digest_of(told)}"
 

@@ -15,6 +15,8 @@ import yaml
 
 from data_catalog.names import comparable_name, plain_name
 from data_catalog.patterns import is_pattern, matching_names
+from extrags.config import PipelineConfig
+from extrags.config.settings import parsed_words, settings_of
 from extrags.errors import ConfigError
 from extrags.store import digest_of
 from extrags.user_paths import expanded
@@ -51,8 +53,8 @@ def chosen_sequences(given: Sequence[str]) -> list[Chosen]:
             `sequences` beside `settings` for all of them.
 
     Raises:
-        ConfigError: for a manifest that cannot be read, one sequence with different settings, a name that
-            stands there twice, or one that is no UTF-8.
+        ConfigError: for a manifest that cannot be read, a wrong word for a setting, one sequence with
+            different settings, a name that stands there twice, or one that is no UTF-8.
         UnknownSequenceError: for a pattern that matches nothing.
         SourceNotFoundError: for a pattern whose sequences are all elsewhere.
     """
@@ -180,4 +182,7 @@ def _settings(given: Any, file: Path, where: str) -> dict[str, Any]:
         raise ConfigError(
             f"the manifest {file}, {where}: expected settings by dotted name, e.g. {{coarse.iterations: 500}}"
         )
-    return dict(given)
+    try:
+        return parsed_words(given, settings_of(PipelineConfig))
+    except ConfigError as error:
+        raise ConfigError(f"the manifest {file}, {where}: {error}") from error

@@ -10,7 +10,7 @@ from extrags.config import LARGEST_SEED, PipelineConfig, profile_config
 from extrags.cores import usable_cores
 from extrags.data_directories import DATA_VARIABLE, user_directories
 from extrags.errors import ConfigError, did_you_mean
-from extrags.user_paths import expanded
+from extrags.user_paths import absolute, expanded
 
 __all__ = [
     "DEFAULT_STORE",
@@ -73,7 +73,7 @@ def _is_deployed() -> bool:
 def pipeline_config(
     profile: str, settings: dict[str, Any] | None = None, seed: int | None = None
 ) -> PipelineConfig:
-    """A profile with overrides and, if given, every stage's seed.
+    """A profile with overrides and, if given, every stage's seed; the path of an imported scene is absolute.
 
     Raises:
         ConfigError: for an unknown profile or setting, or a value out of range.
@@ -83,7 +83,11 @@ def pipeline_config(
         if not 0 <= seed <= LARGEST_SEED:
             raise ConfigError(f"the seed is {seed}; expected 0 to {LARGEST_SEED} (2^63 - 1)")
         config = config.with_seed(seed)
-    return config.with_overrides(settings or {})
+    config = config.with_overrides(settings or {})
+    if config.imported.scene is None:
+        return config
+    # Pages show it: the same file, spelled otherwise, would get a page of its own.
+    return config.with_overrides({"imported.scene": str(absolute(config.imported.scene))})
 
 
 def check_runner(name: str) -> tuple[str, str]:

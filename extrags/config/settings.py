@@ -7,7 +7,8 @@ this: a new setting only takes a field of a model, with its limits and its descr
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+import re
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from types import NoneType, UnionType
@@ -19,7 +20,7 @@ from pydantic_core import PydanticKnownError
 from extrags.config.base import LARGEST_WHOLE_NUMBER, KeyOf, check_size, check_truth_value, has_largest
 from extrags.errors import ConfigError, did_you_mean
 
-__all__ = ["Setting", "groups_of", "settings_of", "unknown_setting"]
+__all__ = ["Setting", "groups_of", "listed_values", "parsed_words", "settings_of", "unknown_setting"]
 
 
 @dataclass(frozen=True)
@@ -142,6 +143,27 @@ def settings_of(model: type[BaseModel]) -> dict[str, Setting]:
         for name, field in inner.model_fields.items()
         if not _is_model(field.annotation)
     }
+
+
+def parsed_words(settings: Mapping[str, Any], known: Mapping[str, Setting]) -> dict[str, Any]:
+    """The same settings with what their texts stand for: `none`, `alex` and `1e-3` as after a setting's flag.
+
+    Args:
+        settings: values of JSON or YAML by dotted name; unknown names stay as they are.
+        known: from `settings_of`.
+
+    Raises:
+        ConfigError: names the setting, what was found and what was expected.
+    """
+    return {
+        name: known[name].parse(value) if isinstance(value, str) and name in known else value
+        for name, value in settings.items()
+    }
+
+
+def listed_values(text: str) -> list[str]:
+    """`8,16` to `["8", "16"]`; a comma between brackets belongs to a value: `[8,8,16],[16,16,32]`."""
+    return re.split(r",(?![^\[]*\])", text)
 
 
 def groups_of(model: type[BaseModel]) -> dict[str, str]:

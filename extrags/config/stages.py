@@ -374,4 +374,9 @@ class PipelineConfig(StageConfig):
                 # Several settings that do not go together.
                 raise ConfigError(f"{place}: {first['ctx']['error']}") from error
             # `with_seed` does not validate: what is wrong may have been there before.
-            raise known[wrong].refused(repr(overrides.get(wrong, first["input"]))) from error
+            found = repr(overrides.get(wrong, first["input"]))
+            reason = first.get("ctx", {}).get("error")
+            # What `KeyOf` says of a name that is none, `refused` says as well, with its suggestion.
+            if isinstance(reason, ValueError) and not isinstance(reason, ConfigError):
+                raise ConfigError(f"setting {wrong} is {found}; {reason}") from error
+            raise known[wrong].refused(found) from error

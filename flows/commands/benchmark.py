@@ -6,7 +6,8 @@ import argparse
 import sys
 from typing import TYPE_CHECKING, Any
 
-from extrags.config import LARGEST_SEED
+from extrags.config import LARGEST_SEED, PipelineConfig
+from extrags.config.settings import parsed_words, settings_of
 from extrags.errors import ConfigError
 from flows.commands.common import (
     items,
@@ -188,12 +189,13 @@ def parsed_variants(given: list[list[str]]) -> dict[str, dict[str, Any]]:
     """`[["dim", "coarse", "coarse.light.exponent=1"]]` to `{"dim": {"method": ..., "coarse...": 1}}`.
 
     Raises:
-        ConfigError: for a variant without settings, or a name that is given twice.
+        ConfigError: for a variant without settings, a wrong value, or a name that is given twice.
     """
     variants: dict[str, dict[str, Any]] = {}
     for name, *rest in given:
         bases = [text for text in rest if "=" not in text]
-        changed = parsed_settings([text for text in rest if "=" in text])
+        assigned = parsed_settings([text for text in rest if "=" in text])
+        changed = parsed_words(assigned, settings_of(PipelineConfig))
         if "=" in name or len(bases) > 1 or not changed:
             raise ConfigError(
                 f"--variant {' '.join([name, *rest])}: expected NAME [METHOD] SETTING=VALUE..., "

@@ -89,6 +89,7 @@ def _renders(given: argparse.Namespace) -> dict[str, Any]:
     if outcome.error is not None:
         raise outcome.error
     sequence = run.store.load(EndoscopicSequence, run.refs["sequence"])
+    held_out: list[str] = []
     without_pose: tuple[str, ...] = ()
     lookup = StoreRunner(root)
     known = SequenceRun(given.sequence, config, root, lookup, given.profile, leave_out=left_out)
@@ -99,12 +100,14 @@ def _renders(given: argparse.Namespace) -> dict[str, Any]:
             left = {sequence.frame_name(int(frame)) for frame in sequence.test}
             without_pose = tuple(name for name in held_out if name not in left)
     if without_pose:
+        from extrags.poses.registration_report import named_frames
+
         logger.warning(
             "%s: %d of %d held-out frames have no estimated pose and are not measured: %s",
             given.sequence,
             len(without_pose),
             len(without_pose) + len(sequence.test),
-            ", ".join(without_pose),
+            named_frames(without_pose, held_out),
         )
     views = read_renders(
         Path(given.renders),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from extrags.errors import ConfigError, SourceNotFoundError
-from extrags.user_paths import expanded
+from extrags.user_paths import absolute
 from flows.commands.options import Parser, add_json, add_method, add_runner, add_stages
 
 __all__ = ["add_arguments", "import_scene"]
@@ -41,7 +41,7 @@ def import_scene(given: argparse.Namespace) -> int:
     """`extrags import`."""
     from flows.commands.run import run
 
-    file = expanded(given.file).absolute()
+    file = absolute(given.file)
     if not file.is_file():
         raise SourceNotFoundError("no such file", file=file)
     for name in ("imported.scene", "imported.scale"):

@@ -347,13 +347,9 @@ class _Assign(argparse.Action):
         option_string: str | None = None,
     ) -> None:
         if option_string == "--set":
-            changed = parsed_settings([values])
-            known = _settings()
-            # A word, such as `alex` or `none`, means what it means after the setting's own flag.
-            changed = {
-                name: known[name].parse(value) if isinstance(value, str) and name in known else value
-                for name, value in changed.items()
-            }
+            from extrags.config.settings import parsed_words
+
+            changed = parsed_words(parsed_settings([values]), _settings())
         else:
             name = SHORT_NAMES.get(str(option_string), str(option_string).removeprefix("--"))
             changed = {name: _settings()[name].parse(values)}

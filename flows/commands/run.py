@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import re
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -183,7 +182,7 @@ def parsed_matrix(given: list[str]) -> dict[str, list[Any]]:
         ConfigError: for an unknown setting, one that is given twice, or a wrong value.
     """
     from extrags.config import PipelineConfig
-    from extrags.config.settings import settings_of, unknown_setting
+    from extrags.config.settings import listed_values, settings_of, unknown_setting
 
     known = settings_of(PipelineConfig)
     matrix: dict[str, list[Any]] = {}
@@ -195,8 +194,7 @@ def parsed_matrix(given: list[str]) -> dict[str, list[Any]]:
             raise unknown_setting(name, known)
         if name in matrix:
             raise ConfigError(f"--matrix {name} is given twice; give all of its values at once")
-        # A comma between brackets belongs to the value.
-        matrix[name] = [known[name].parse(value) for value in re.split(r",(?![^\[]*\])", values)]
+        matrix[name] = [known[name].parse(value) for value in listed_values(values)]
     return matrix
 
 

@@ -93,6 +93,9 @@ class TestConfig:
             ("coarse.light.exponent", math.inf, "is inf; expected a finite number above 0"),
             ("coarse.light.exponent", "-inf", "is '-inf'; expected a finite number above 0"),
             ("ingest.end_s", math.nan, "is nan; expected a finite number above 0 or none"),
+            ("evaluate.lpips_nets", ["alex", "alex"], "is ['alex', 'alex']; a backbone is given twice"),
+            ("enhance.samples", 0, "is 0; expected mean, or a number from 1 to"),
+            ("enhance.backend", "clasical", "expected embedded"),
         ],
     )
     def test_a_wrong_value_is_one_sentence_with_the_range(

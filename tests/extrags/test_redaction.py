@@ -30,6 +30,11 @@ CAPTION_KEY = "sk-caption-0123456789"
             "https://b.s3.aws/x?X-Amz-Signature=***&X-Amz-Date=1",
         ),
         ("Authorization: Bearer abcdefghijklmnop", "Authorization: Bearer ***"),
+        ("proxy-authorization=basic dXNlcjpodXNo", "proxy-authorization=basic ***"),
+        ("{'Authorization': 'Basic dXNlcjpodXNo'}", "{'Authorization': 'Basic ***'}"),
+        ("(b'Authorization', b'Bearer abcdefghijklmnop')", "(b'Authorization', b'Bearer ***')"),
+        (r"Invalid header value b'Bearer abcdefghijklmnop\n'", r"Invalid header value b'Bearer ***\n'"),
+        ("refused: Bearer hf_AbCdEfGh0123456789", "refused: Bearer ***"),
         (f"asked with {CAPTION_KEY}", "asked with ***"),
     ],
 )
@@ -51,6 +56,9 @@ def test_credentials_are_taken_out(text: str, shown: str, monkeypatch: pytest.Mo
         "file:///store/c3vdv2/c1@sparse",
         "dask:tcp://10.0.0.1:8786",
         "a basic pipeline of the bearer",
+        "/data/basic colonoscopies/theirs.ply",
+        "Basic Colonoscopies_2024/C3VDv2@sparse",
+        "bearer colonoscopies/Frames_2024/000120.png",
         "https://host/x?profile=quick&seed=3",
     ],
 )
@@ -85,11 +93,24 @@ def test_logs_do_not_tell() -> None:
 
 def test_settings_with_credentials_are_refused() -> None:
     url = f"https://user:{SECRET}@hub/model"
-    with pytest.raises(ConfigError, match=r"setting enhance\.pretrained\.model is") as refused:
+    said = (
+        r"setting enhance\.pretrained\.model is 'https://\*\*\*@hub/model'; it holds a password, key or token"
+    )
+    with pytest.raises(ConfigError, match=said) as refused:
         PipelineConfig().with_overrides({"enhance.pretrained.model": url})
     with pytest.raises(ValidationError) as invalid:
         EnhanceConfig.model_validate({"pretrained": {"model": url}})
     assert SECRET not in str(refused.value) + str(invalid.value)
+
+
+def test_folders_of_ordinary_words_keep_their_names(tmp_path: Path) -> None:
+    scene = "/data/basic colonoscopies/theirs.ply"
+    assert PipelineConfig().with_overrides({"imported.scene": scene}).imported.scene == scene
+    store = Store(tmp_path)
+    label = "basic colonoscopies/first"
+    with store.slot(stage="toy", version=1, key="toy-v1-0", label=label) as slot:
+        slot.save_json("value.json", 1)
+    assert store.manifest(slot.ref).label == label
 
 
 @pytest.mark.parametrize("url", [f"s3://AKIA:{SECRET}@bucket/x", f"https://host/store?token={SECRET}"])

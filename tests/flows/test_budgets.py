@@ -44,6 +44,15 @@ class TestVary:
                 "coarse.iterations+finetune.iterations=9",
                 [{"coarse.iterations": 9, "finetune.iterations": 9}],
             ),
+            ("enhance.max_width=none,320", [{"enhance.max_width": None}, {"enhance.max_width": 320}]),
+            (
+                "enhance.channels=[8,8,16],[16,16,32]",
+                [{"enhance.channels": (8, 8, 16)}, {"enhance.channels": (16, 16, 32)}],
+            ),
+            (
+                "evaluate.lpips_nets=alex,vgg",
+                [{"evaluate.lpips_nets": ("alex",)}, {"evaluate.lpips_nets": ("vgg",)}],
+            ),
             ("enhance.steps=auto,1", [{"enhance.steps": "auto"}, {"enhance.steps": 1}]),
         ],
     )
@@ -56,6 +65,7 @@ class TestVary:
             ("coarse.iterations", "expected NAME=VALUE"),
             ("coarse.iterations=", "expected NAME=VALUE"),
             ("coarse.iteration=5", "coarse.iteration"),
+            ("coarse.iterations=[5", r"setting coarse\.iterations is \[5; expected a whole number"),
             ("ingest.width+ingest.height=1+2+3", "3 values for 2 settings"),
         ],
     )

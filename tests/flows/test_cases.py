@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,7 @@ def leave(store: str, of: SequenceCase, *stages: StageRow, status: Any = "ok", u
     record_outcome(Store(store), of, outcome, until, of.config())
 
 
+<<<<<<< HEAD
 def leave_read(store: str, of: SequenceCase, work: Workload, *more: StageRow) -> None:
     """Leave the record of a run that read frames and estimated their poses, each in 100 seconds."""
     rows = [StageRow(stage, "ran", made_seconds=100.0) for stage in ("ingest", "poses")]
@@ -62,10 +64,38 @@ def with_frames(folder: Path, number: int = 9) -> Path:
 
 
 def test_a_run_of_an_imported_scene_stands_beside_the_sequence_own() -> None:
+=======
+def test_a_run_of_an_imported_scene_stands_beside_the_sequence_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+>>>>>>> words
     own, imported = case(), SequenceCase(SEQUENCE, profile="quick", settings={"imported.scene": "their.ply"})
     assert own.record != imported.record
     assert own.record == SequenceCase(SEQUENCE, profile="quick").record
-    assert imported.distinguishing == {"imported.scene": "their.ply"}
+    assert imported.distinguishing == {"imported.scene": str(tmp_path / "their.ply")}
+
+
+def test_one_imported_scene_is_one_run_however_its_file_is_spelled(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    settings, file = {**TINY, "imported.scene": "their.ply"}, str(tmp_path / "their.ply")
+    relative = SequenceCase(SEQUENCE, profile="quick", settings=settings)
+    full = replace(relative, settings={**settings, "imported.scene": file})
+    varied = replace(relative, settings=TINY, changed={"imported.scene": "./their.ply"})
+    assert relative.record == full.record == varied.record
+    # Its page as well, which shows all settings.
+    assert relative.config() == full.config() == varied.config()
+    assert full.former_record == full.record
+    # What earlier versions left under the path as it was written goes.
+    store = Store(tmp_path / "store")
+    leave(store.root, full, StageRow("report", "ran"), until="report")
+    (record,) = outcome_records(store).values()
+    remove_record(store, full.record)
+    write_record(store, relative.former_record, {**record, "variant": {"imported.scene": "their.ply"}})
+    leave(store.root, relative, StageRow("report", "ran"), until="report")
+    assert list(outcome_records(store)) == [full.record]
 
 
 class TestPaths:

@@ -45,10 +45,10 @@ def folders(finished: tuple[str, SequenceOutcome], tmp_path_factory: pytest.Temp
     return root
 
 
-def all_but_one_held_out(sequence: EndoscopicSequence, config: object) -> PoseEstimate:
-    """The poses of the source, of all frames but the first held-out one."""
+def without_first_held_out(sequence: EndoscopicSequence, config: object) -> PoseEstimate:
+    """The poses of the source, of all frames but the first three held-out ones."""
     assert sequence.world_from_camera is not None
-    registered = np.arange(len(sequence)) != sequence.test[0]
+    registered = ~np.isin(np.arange(len(sequence)), sequence.test[:3])
     found = np.where(registered[:, None, None], sequence.world_from_camera, np.nan)
     names = ("registered_train", "n_train", "registered_test", "n_test")
     counts = {**dict.fromkeys(names, 1), "triangulation_angle_deg": 10}
@@ -95,7 +95,7 @@ class TestEvaluate:
         capsys: pytest.CaptureFixture[str],
         caplog: pytest.LogCaptureFixture,
     ) -> None:
-        monkeypatch.setattr("extrags.poses.estimate_poses", all_but_one_held_out)
+        monkeypatch.setattr("extrags.poses.estimate_poses", without_first_held_out)
         store = str(tmp_path / "store")
         config = tiny_config(poses__replace_given=True)
         outcome = run_sequence(SEQUENCE, config, store, DirectRunner(store), until="poses")
@@ -103,17 +103,17 @@ class TestEvaluate:
             EndoscopicSequence.load(Path(outcome.artefacts[name]) / "sequence")
             for name in ("ingest", "sequence")
         )
-        assert len(posed.test) == len(read.test) - 1
+        assert len(posed.test) == len(read.test) - 3
         folder = tmp_path / "renders"
         folder.mkdir()
-        for frame in read.test if also else read.test[1:]:
+        for frame in read.test if also else read.test[3:]:
             Image.fromarray(read.rgb[frame]).save(folder / f"{read.frame_name(int(frame))}.png")
         more = ["--set", "poses.replace_given=true", "--renders", str(folder), "--json", "-"]
         assert main(["evaluate", SEQUENCE, *settled(store), *more]) == 0
         assert json.loads(capsys.readouterr().out)["n_views"] == len(posed.test)
-        left_out = read.frame_name(int(read.test[0]))
-        assert f"1 of {len(read.test)} held-out frames have no estimated pose" in caplog.text
-        assert f"not measured: {left_out}" in caplog.text
+        first, last = (read.frame_name(int(read.test[place])) for place in (0, 2))
+        assert f"3 of {len(read.test)} held-out frames have no estimated pose" in caplog.text
+        assert f"not measured: {first} to {last}\n" in caplog.text
 
     def test_a_finished_run(
         self, finished: tuple[str, SequenceOutcome], tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -235,6 +235,12 @@ def test_lists_and_variants() -> None:
     assert parsed_variants([["dim", "3dgs", "coarse.iterations=5"], ["x", "coarse.light.enabled=false"]]) == {
         "dim": {"method": "3dgs", "coarse.iterations": 5},
         "x": {"coarse.light.enabled": False},
+    }
+    words = ["enhance.max_width=none", "evaluate.lpips_nets=alex"]
+    assert parsed_variants([["whole", "extrags", *words]])["whole"] == {
+        "method": "extrags",
+        "enhance.max_width": None,
+        "evaluate.lpips_nets": ("alex",),
     }
     for wrong in ([["a", "b", "c", "x.y=1"]], [["a=1"]], [["a", "x.y=1"], ["a", "x.y=2"]]):
         with pytest.raises(ConfigError, match="--variant a"):

@@ -100,6 +100,18 @@ def test_yaml_and_json_have_settings(tmp_path: Path) -> None:
     assert found == [Chosen("phantom/0@sparse", {"coarse.seed": 2}), Chosen("phantom/1@sparse")]
 
 
+def test_words_mean_what_they_mean_after_a_flag(tmp_path: Path) -> None:
+    text = "settings: {enhance.max_width: none}\nsequences: [{sequence: phantom/1@sparse, settings: {%s}}]"
+    given = manifest(tmp_path, "a.yaml", text % "coarse.thickness: 1e-3, evaluate.lpips_nets: alex")
+    assert chosen_sequences([given])[0].settings == {
+        "enhance.max_width": None,
+        "coarse.thickness": 1e-3,
+        "evaluate.lpips_nets": ("alex",),
+    }
+    with pytest.raises(ConfigError, match=r"a\.yaml, entry 1: setting enhance\.max_width is wide; expected"):
+        chosen_sequences([manifest(tmp_path, "a.yaml", text % "enhance.max_width: wide")])
+
+
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
