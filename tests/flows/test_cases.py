@@ -43,7 +43,6 @@ def leave(store: str, of: SequenceCase, *stages: StageRow, status: Any = "ok", u
     record_outcome(Store(store), of, outcome, until, of.config())
 
 
-<<<<<<< HEAD
 def leave_read(store: str, of: SequenceCase, work: Workload, *more: StageRow) -> None:
     """Leave the record of a run that read frames and estimated their poses, each in 100 seconds."""
     rows = [StageRow(stage, "ran", made_seconds=100.0) for stage in ("ingest", "poses")]
@@ -63,13 +62,10 @@ def with_frames(folder: Path, number: int = 9) -> Path:
     return folder
 
 
-def test_a_run_of_an_imported_scene_stands_beside_the_sequence_own() -> None:
-=======
 def test_a_run_of_an_imported_scene_stands_beside_the_sequence_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
->>>>>>> words
     own, imported = case(), SequenceCase(SEQUENCE, profile="quick", settings={"imported.scene": "their.ply"})
     assert own.record != imported.record
     assert own.record == SequenceCase(SEQUENCE, profile="quick").record
