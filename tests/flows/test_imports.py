@@ -41,6 +41,8 @@ def command(*words: str) -> str:
             pytest.param(command(verb, "--help"), HEAVY.replace(" pydantic", ""), id=f"{verb} --help")
             for verb in ("plan", "run", "bench", "status")
         ),
+        # Of tables of commands.
+        pytest.param("from extrags.report.wording import duration", f"torch {RARE}", id="words of pages"),
         # Keys of artefacts are computed with the wiring alone.
         pytest.param(
             "import flows.wiring, flows.dataset",
