@@ -363,10 +363,7 @@ def board_rows(store: Store, patterns: Sequence[str] = (), target: str = "") -> 
                 metrics=tree.get("final") or tree.get("coarse"),
                 protocol=record.get("protocol"),
                 held_out_trained_on=held_out_trained_on(record),
-                imported=any(
-                    settings.get("imported.scene")
-                    for settings in (record["variant"], record.get("settings", {}))
-                ),
+                imported=bool(record["variant"].get("imported.scene")),
                 link="" if page is None else _address(page, target),
             )
         )

@@ -67,13 +67,12 @@ class ComparedRun:
     link: str = ""
     held_out_trained_on: bool = False
     imported: bool = False
+    held_out: str = ""
 
     @property
     def unseen(self) -> bool:
         """Whether it is known not to have seen these views."""
         return not (self.held_out_trained_on or self.imported)
-
-    held_out: str = ""
 
 
 def build_run_comparison(sequence: EndoscopicSequence, runs: Sequence[ComparedRun], *, views: int = 6) -> str:
@@ -154,13 +153,12 @@ def _summary(runs: Sequence[ComparedRun]) -> str:
     ]
     if not known:
         return text
-    best, name = max(known, key=lambda item: item[0])
+    highest = max(value for value, _ in known)
+    # Of those that are written alike the first: nobody is better by what is not shown.
+    best, name = next(item for item in known if _same(item[0], highest, 2))
     text += f" The highest PSNR is that of {name}, {number(best, 2)} dB"
     first = values[0]
-    if runs[0].unseen and _same(first, best, 2):
-        # Others may be written alike; the first one is what all are held against.
-        return text.replace(f"that of {name}", f"that of {runs[0].name}") + "."
-    if first is None or not runs[0].unseen:
+    if first is None or name == runs[0].name or not runs[0].unseen:
         return text + "."
     return f"{text}, {number(best - first, 2)} dB above {runs[0].name}."
 

@@ -93,6 +93,22 @@ class TestRandomWalk:
         assert random_walk(replace(MOVES, space=stuck), training(), 9, 0) == []
 
 
+@pytest.mark.parametrize(("share", "possible"), [(5e-6, True), (1e-3, False)])
+def test_a_camera_nearer_than_the_margin_keeps_its_distance_but_for_rounding(
+    share: float, possible: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    start = training()[0].world_from_camera[0]
+
+    def clearance_at(space: FreeSpace, points: np.ndarray) -> np.ndarray:
+        there = np.all(points == start[:3, 3], axis=1)
+        return np.where(there, 0.01, 0.01 * (1 - share))
+
+    monkeypatch.setattr(FreeSpace, "clearance_at", clearance_at)
+    moved = start.copy()
+    moved[2, 3] += 0.1
+    assert MOVES.allowed(start, moved[None]).tolist() == [possible]
+
+
 def test_perturbed_views_stay_near_their_training_view() -> None:
     clips = perturbed_views(MOVES, training(), 30, seed=0)
     assert [clip.anchor for clip in clips[:3]] == MOVES.starts(training())
