@@ -4,7 +4,7 @@
 
 * `methods`: every method by dataset, setting and region, plain and aligned, with the share of the way to the
   oracle and the differences of `extrags` to `3dgs`.
-* `ablation`: each variant less `extrags`, paired, with 95 % intervals.
+* `ablation`: each variant less `extrags`, scene by scene, and the mean with its 95 % interval.
 * `budget`: the coarse and the final scene by budget.
 * `judge`: what fine-tuning changed on training frames left out of a trial, of every run in a store.
 
@@ -17,17 +17,24 @@ import argparse
 import json
 import sys
 from collections.abc import Iterable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from extrags.finetuning_judge import AMOUNTS
-from extrags.metrics.comparison import CEILING, compare_runs, dataset_of
+from extrags.metrics.comparison import CEILING, compare_runs, dataset_of, paired, spread
 from extrags.metrics.registry import metric_named
 from flows.tables import difference_text, figure, markdown_table, share_text, spread_text
 
 METRICS = ("psnr", "ssim", "lpips_alex", "lpips_vgg", "flip", "depth_absrel")
 REGIONS = ("whole", "observed", "unobserved")
-ABLATED = ("psnr", "observed.psnr", "unobserved.psnr", "lpips_alex", "observed.depth_absrel")
+ABLATED = (
+    "aligned.psnr",
+    "observed.aligned.psnr",
+    "unobserved.aligned.psnr",
+    "aligned.lpips_alex",
+    "observed.depth_absrel",
+)
 
 KEPT = {None: "the coarse scene", 0.0: "real views alone"}
 
@@ -115,15 +122,26 @@ def methods_tables(cases: Sequence[dict[str, Any]]) -> str:
 
 
 def ablation_tables(cases: Sequence[dict[str, Any]]) -> str:
-    """Each variant less the whole method, by dataset."""
-    comparison = compare_runs(cases, "extrags")
-    rows = [row for row in comparison["paired_datasets"] if row["method"] != "3dgs"]
-    table = [
-        [row["dataset"], row["method"], row["n_sequences"], row["n_seeds"]]
-        + [difference_text(name, row["figures"].get(name)) for name in ABLATED]
-        for row in rows
-    ]
-    return markdown_table(["dataset", "without", "scenes", "seeds", *ABLATED], table)
+    """Each variant less the whole method: scene by scene, and the mean over all with its interval."""
+    scenes = list(dict.fromkeys((case["sequence"], case["setting"]) for case in cases))
+    variants = [name for name in dict.fromkeys(case["method"] for case in cases) if name != "extrags"]
+    texts = []
+    for name in ABLATED:
+        table = []
+        for variant in variants:
+            # Seeds of a scene are one sample: its mean.
+            each: dict[tuple[str, str], list[float]] = {}
+            for case, difference in paired(cases, variant, "extrags", name):
+                each.setdefault((case["sequence"], case["setting"]), []).append(difference)
+            means = {scene: sum(found) / len(found) for scene, found in each.items()}
+            single = [
+                difference_text(name, asdict(spread([means[scene]])) if scene in means else None)
+                for scene in scenes
+            ]
+            table.append([variant, *single, difference_text(name, asdict(spread(list(means.values()))))])
+        head = ["without", *("@".join(filter(None, scene)) for scene in scenes), "mean"]
+        texts.append(f"`{name}`:\n\n{markdown_table(head, table)}\n")
+    return "\n".join(texts)
 
 
 def budget_tables(cases: Sequence[dict[str, Any]]) -> str:

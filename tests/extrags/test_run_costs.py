@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from extrags.config import PipelineConfig, profile_config
 from extrags.config.settings import settings_of
@@ -138,10 +139,21 @@ class TestWorkloadSettings:
 
 
 def with_value(base: PipelineConfig, name: str, value: object) -> PipelineConfig:
-    """With another value of a setting; as it was where that does not go together with the others."""
-    try:
+    """With another value of a setting; as it was where that does not go together with the rest of its stage.
+
+    Only that stage is validated: of all of them together, thousands of values take several seconds.
+    """
+    if "." not in name:
         return base.with_overrides({name: value})
-    except ConfigError:
+    stage, *parents, leaf = name.split(".")
+    before = getattr(base, stage)
+    tree = node = before.model_dump()
+    for parent in parents:
+        node = node[parent]
+    node[leaf] = value
+    try:
+        return base.model_copy(update={stage: type(before).model_validate(tree)})
+    except ValidationError:
         return base
 
 

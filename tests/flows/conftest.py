@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import os
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -66,9 +67,9 @@ def little_work() -> Iterator[None]:
         yield
 
 
-@pytest.fixture(scope="package", autouse=True)
+@contextmanager
 def threads_as_users_have_them() -> Iterator[None]:
-    """The only package where runs of all stages divide their work between the cores."""
+    """Work is divided between the cores."""
     if not native.native_isa():
         yield
         return
@@ -88,7 +89,10 @@ def frames_read() -> FramesRead:
 def finished(
     little_work: None, frames_read: FramesRead, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[str, SequenceOutcome]:
-    """A store in which the tiny sequence has gone through all stages."""
+    """A store in which the tiny sequence has gone through all stages.
+
+    On all cores: other runs of these tests have one thread, and are compared with it bit by bit.
+    """
     store = str(tmp_path_factory.mktemp("finished") / "store")
     read = EndoscopicSequence.load
 
@@ -98,7 +102,7 @@ def finished(
         frames_read.as_read.append({name: value.copy() for name, value in images_of(found).items()})
         return found
 
-    with pytest.MonkeyPatch.context() as patched:
+    with pytest.MonkeyPatch.context() as patched, threads_as_users_have_them():
         patched.setattr(EndoscopicSequence, "load", noted)
         outcome = run_sequence(SEQUENCE, tiny_config(), store, DirectRunner(store), profile="quick")
     if outcome.error is not None:
