@@ -25,6 +25,7 @@ from extrags.config import DEFAULT_PROFILE, PROFILES, CoarseConfig, EnhanceConfi
 from extrags.evaluation import render
 from extrags.events import MetricRecorded, Progress, emit
 from extrags.metrics.image import psnr_per_image
+from extrags.metrics.lpips import MIN_SIDE_PX
 from extrags.pseudo_views import PseudoViews
 from extrags.restoration.protocol import Enhancer, among_kept, never_trained_on
 from extrags.restoration.restored_renders import RestoredShares, restored_shares
@@ -121,14 +122,14 @@ class Judgement(Storable):
     def applied_to(self, config: FinetuneConfig) -> FinetuneConfig:
         """The settings with the weight of virtual views that is kept, and their share in further rounds.
 
-        For amounts above zero; others change nothing.
+        Shares become no larger than left-out frames allow. For amounts above zero; others change nothing.
         """
         if not self.amount:
             return config
         changes = {"pseudo_weight": self.amount * config.pseudo_weight}
-        if self.restored_shares is not None:
-            changes["known_share"] = self.restored_shares.known
-            changes["invented_share"] = self.restored_shares.invented
+        if self.restored_shares is not None and self.restored_shares != RestoredShares():
+            changes["known_share"] = min(config.known_share, self.restored_shares.known)
+            changes["invented_share"] = min(config.invented_share, self.restored_shares.invented)
         return config.model_copy(update=changes)
 
     def save(self, path: Path) -> None:
@@ -372,6 +373,9 @@ def _restored(
 ) -> PseudoViews:
     fewer = enhance.model_copy(update={"max_views": max_views})
     measure = PerceptualDifference.available() if measure is None else measure
+    if min(sequence.width, sequence.height) < MIN_SIDE_PX:
+        # Trials are small; what is fine-tuned after them may be large enough for LPIPS itself.
+        measure = replace(measure, raw=False)
     parts: list[PseudoViews] = []
     for part in restored_batches(scene, sequence, trajectories, enhancer, fewer, measure):
         parts.append(part)

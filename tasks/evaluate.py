@@ -66,7 +66,7 @@ def restoring_settings(config: EnhanceConfig, finish: Finish) -> EnhanceConfig:
     return settings.model_copy(update={"precision": chosen_precision(config)})
 
 
-@stage("evaluate-restore", version=14)
+@stage("evaluate-restore", version=15)
 def restore(
     slot: Slot,
     renders: Ref,

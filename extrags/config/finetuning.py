@@ -48,11 +48,15 @@ class FinetuneConfig(StageConfig):
         0.6,
         ge=0,
         le=1,
-        description="in further rounds: of the restored view, where the coarse scene knows the surface; what "
-        "left-out frames tell takes its place",
+        description="in further rounds: of the restored view, where the coarse scene knows the surface; less "
+        "where left-out frames tell that less serves",
     )
     invented_share: float = Field(
-        0.6, ge=0, le=1, description="in further rounds: of the restored view, where it is invented"
+        0.6,
+        ge=0,
+        le=1,
+        description="in further rounds: of the restored view, where it is invented; less where left-out "
+        "frames tell that less serves",
     )
     densify_share: float = Field(0.6, ge=0, le=1, description="densification ends at this share")
     pseudo_share: float = Field(

@@ -14,6 +14,7 @@ __all__ = [
     "CheckpointConfig",
     "EnhanceConfig",
     "IouSet",
+    "LevelWidth",
     "PretrainedConfig",
     "ReferenceChoice",
     "SeamlessCloning",
@@ -24,6 +25,9 @@ ReferenceChoice = Literal["covisibility", "nearest"]
 
 SeamlessCloning = Literal["auto", "always", "never"]
 """When what a restorer invents is cloned seamlessly into what is known."""
+
+LevelWidth = Annotated[int, Field(gt=0, multiple_of=8)]
+"""Channels of a level of the U-Net, which are normalised in eight groups."""
 
 IouSet = Literal["reference", "union"]
 """What the overlap of two views is a share of."""
@@ -175,8 +179,8 @@ class EnhanceConfig(StageConfig):
         "take longer than the reconstructions they come from, and more of them hardly tell more",
     )
     batch: int = Field(4, ge=1, description="crops per step")
-    crop: int = Field(96, ge=32, description="crop size in pixels, a multiple of 8")
-    channels: tuple[int, int, int] = Field(
+    crop: int = Field(96, ge=32, multiple_of=8, description="crop size in pixels, a multiple of 8")
+    channels: tuple[LevelWidth, LevelWidth, LevelWidth] = Field(
         (32, 64, 96), description="widths of the U-Net's levels, where it starts from no weights"
     )
     learning_rate: float = Field(8e-4, gt=0, description="of a training from nothing")

@@ -30,7 +30,7 @@ def write_description(folder: Path, description: Mapping[str, Any]) -> None:
         description: ready for JSON; its entry `backend` names the backend that reads the folder again.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / DESCRIPTION).write_text(json.dumps(description, indent=2) + "\n")
+    (folder / DESCRIPTION).write_text(json.dumps(description, indent=2, allow_nan=False) + "\n")
 
 
 def read_description(file: Path) -> dict[str, Any]:

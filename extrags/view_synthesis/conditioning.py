@@ -288,7 +288,8 @@ def condition(layers: Layers, transfer: LightTransfer, *, folded: bool = True) -
     # Without an invented reference these sums add zero: every bit stays.
     color = color + invented_weight * layers.get("invented")
     known = known + invented_weight
-    solid = _within_range(color / known.clamp_min(1e-3))
+    # However faint the evidence is, it has a colour of its own.
+    solid = _within_range(color / known.clamp_min(torch.finfo(known.dtype).tiny))
     base = _within_range(
         transfer.apply_response(push_pull(transfer.invert_response(solid) / falloff, known) * falloff)
     )

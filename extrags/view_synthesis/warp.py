@@ -42,6 +42,8 @@ GOOD_QUALITY = 0.02
 """Reference quality from which the blend replaces the rendering completely."""
 HIGHLIGHT_STEP = 0.12
 """Excess brightness at which the weight of a sample, taken for a highlight, falls to 1/e."""
+FAINT = 1e-3
+"""Votes below it are raised together before they are squared: a mean is one however faint its samples."""
 BRIGHTNESS_LIMIT = 8.0
 """Larger brightness ratios amplify noise more than they inform."""
 EXPONENT_RANGE = (0.0, 3.0)
@@ -196,7 +198,7 @@ def _warp_one(
     rgb = _relit(references, chosen, here, seen, gain)
     trust = seen.weight * (seen.quality / good_quality).clamp(max=1)
     # Squared, because the mean of many views is blurred: the good ones shall dominate.
-    votes = (seen.weight * seen.quality).square()
+    votes = _above_rounding(seen.weight * seen.quality).square()
     luminance = rgb.mean(dim=1)
     first = _weighted(luminance, votes)
     votes = votes * torch.exp(-((luminance - first).clamp_min(0) / HIGHLIGHT_STEP).square())
@@ -260,6 +262,12 @@ def seen_by_others(
 
 def _weighted(values: Tensor, votes: Tensor) -> Tensor:
     return (values * votes).sum(dim=0) / votes.sum(dim=0).clamp_min(1e-12)
+
+
+def _above_rounding(votes: Float[Tensor, "k p"]) -> Float[Tensor, "k p"]:
+    """The same proportions; faint ones are raised to where their squares still give a mean."""
+    most = votes.amax(dim=0)
+    return votes / torch.where((most > 0) & (most < FAINT), most, torch.ones(()))
 
 
 def _surface(camera: Cameras, depth_mm: Float[Tensor, "1 h w"], stride: int) -> _Surface:

@@ -224,7 +224,7 @@ def pretrain(given: argparse.Namespace) -> int:
         restorer = start_of_refiner(given.start or COLONS)
     else:
         if given.start is not None:
-            start = EmbeddedEnhancer.load(starting_weights(given.start))
+            start = EmbeddedEnhancer.load(starting_weights(given.start)).without_scene()
         if not given.scenes_only:
             check_settings(config, start)
     # As things are now: in some hours the working tree may be another.

@@ -157,7 +157,7 @@ def make_views(source: SceneSource, file: Path, restorer: str, origin: str) -> N
     from extrags.restoration.diffusion.weights import starting_weights
     from extrags.restoration.hidden_depth.examples import HiddenDepthExamples
 
-    enhancer = EmbeddedEnhancer.load(starting_weights(restorer))
+    enhancer = EmbeddedEnhancer.load(starting_weights(restorer)).without_scene()
     try:
         recording = source.recording(to_restore=False)
         made = HiddenDepthExamples.of_recording(recording, enhancer, profile_config("quick"), source.seed)

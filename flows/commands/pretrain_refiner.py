@@ -71,7 +71,10 @@ def start_of_refiner(start: str) -> RefinedRestorer:
     from extrags.restoration.diffusion.weights import starting_weights, weights_digest
 
     try:
-        restorer, digest = EmbeddedEnhancer.load(starting_weights(start)), str(weights_digest(start))
+        restorer, digest = (
+            EmbeddedEnhancer.load(starting_weights(start)).without_scene(),
+            str(weights_digest(start)),
+        )
     except ExtragsError as error:
         raise ConfigError(f"--start {start}: {error}") from error
     half = chosen_precision(EnhanceConfig()) == "bfloat16"

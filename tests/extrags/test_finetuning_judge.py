@@ -15,16 +15,19 @@ from extrags.confidence import PerceptualDifference
 from extrags.config import CoarseConfig, DensifyConfig, EnhanceConfig, FinetuneConfig
 from extrags.config.finetuning import JudgeConfig
 from extrags.finetuning_judge import AMOUNTS, Judgement, Trial, decide, judge_finetuning
+from extrags.metrics.lpips import Lpips
 from extrags.restoration.benchmark.variants import AsRendered
 from extrags.restoration.classical import ClassicalEnhancer
 from extrags.restoration.protocol import Clip, Enhancer, Restoration
 from extrags.restoration.restored_renders import RESTORED_SHARE, RestoredShares, restored_shares
+from extrags.restoration.trajectories import restored_batches
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
 from extrags.training import TrainingResult
 from extrags.training.frame_weights import FrameWeights, frame_weights
 from extrags.training.leave_out import MIN_FRAMES
 from tests.extrags.lit_tube import Tube, tube_cameras
+from tests.extrags.random_lpips import random_weights
 
 COARSE = CoarseConfig(iterations=60, max_points=300, densify=DensifyConfig(max_gaussians=500))
 FINETUNE = FinetuneConfig(
@@ -46,7 +49,13 @@ def trajectories() -> list[Cameras]:
     return [tube_cameras(3, offset_mm=3.0, start_mm=start, turn=0.4) for start in (0.0, 4.0)]
 
 
-def judged(tube: Tube, enhancer: Enhancer | None, config: FinetuneConfig = FINETUNE) -> Judgement:
+def judged(
+    tube: Tube,
+    enhancer: Enhancer | None,
+    config: FinetuneConfig = FINETUNE,
+    *,
+    measure: PerceptualDifference = WITHOUT_WEIGHTS,
+) -> Judgement:
     return judge_finetuning(
         tube.scene,
         tube.sequence,
@@ -55,7 +64,7 @@ def judged(tube: Tube, enhancer: Enhancer | None, config: FinetuneConfig = FINET
         config,
         ENHANCE,
         COARSE,
-        measure=WITHOUT_WEIGHTS,
+        measure=measure,
     )
 
 
@@ -263,6 +272,23 @@ def test_a_scene_that_is_kept(tube: Tube) -> None:
     assert "rebuilt from frames" in found.reason
 
 
+def test_trials_too_small_for_lpips_are_judged_without(tube: Tube, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`enhance.pixel_confidence=raw` is LPIPS itself, which the frames are large enough for."""
+    measures = []
+
+    def told(*given: Any) -> Any:
+        measures.append(given[-1].for_images(given[1].width, given[1].height))
+        return restored_batches(*given)
+
+    monkeypatch.setattr(finetuning_judge, "restored_batches", told)
+    monkeypatch.setattr(finetuning_judge, "MIN_LEFT_OUT", 1)
+    raw = PerceptualDifference(Lpips("alex", random_weights("alex")), raw=True)
+    small = FINETUNE.model_copy(update={"judge": FINETUNE.judge.model_copy(update={"max_width": 24})})
+    found = judged(tube, ClassicalEnhancer(""), small, measure=raw)
+    assert found.trials
+    assert {measure.name for measure in measures} == {"perceptual_map"}
+
+
 def test_held_out_frames_are_not_looked_at(tube: Tube) -> None:
     sequence = tube.sequence
     test = np.setdiff1d(np.arange(len(sequence)), sequence.train)
@@ -351,6 +377,11 @@ def test_the_weight_of_virtual_views_follows() -> None:
     assert Judgement(1.0, "").applied_to(config) == config
     shares = Judgement(1.0, "", restored_shares=RestoredShares(known=0.2, invented=0.5)).applied_to(config)
     assert (shares.known_share, shares.invented_share) == (0.2, 0.5)
+    # Asked for less, less it is; and where left-out frames lose nothing, what is asked for.
+    less = FinetuneConfig(known_share=0.1, invented_share=0.9)
+    shares = Judgement(1.0, "", restored_shares=RestoredShares(known=0.2, invented=0.5)).applied_to(less)
+    assert (shares.known_share, shares.invented_share) == (0.1, 0.5)
+    assert Judgement(1.0, "", restored_shares=RestoredShares()).applied_to(less) == less
     assert Judgement(0.0, "").applied_to(config) == config
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -47,16 +48,18 @@ from extrags.view_synthesis.references import LightTransfer
 
 __all__ = ["EmbeddedEnhancer", "pretrained"]
 
-FORMAT = 7
+FORMAT = 8
 """Raised when a saved restorer cannot be read by newer code."""
 _UNKNOWN_DOMAIN: dict[str, Any] = {"domain": None, "domain_score": None, "scene_calibrated": False}
-_PLAIN: dict[str, Any] = {"trained_on": "", "seamless": False}
+_ONE_CURVE: dict[str, Any] = {"weights_calibration": None}
+_PLAIN: dict[str, Any] = {"trained_on": "", "seamless": False, **_ONE_CURVE}
 EARLIER_FORMATS: dict[int, dict[str, Any]] = {
     2: {"generative": False, "drawing": False, "depth_from_image": None, **_PLAIN},
     3: {"depth_from_image": None, **_PLAIN},
     4: _PLAIN,
     5: _PLAIN,
-    6: {"seamless": False},
+    6: {"seamless": False, **_ONE_CURVE},
+    7: _ONE_CURVE,
 }
 """What earlier formats that can be read lack, and what stands for it."""
 FIRST_DOMAIN_FORMAT = 5
@@ -105,6 +108,8 @@ class EmbeddedEnhancer:
         trained_on: kind of scene that its weights have learned from, for reports; empty if unknown.
         seamless: what it invents is cloned seamlessly into the base image, which stays where it is certain:
             for scenes on which the network does harm where all is known.
+        weights_calibration: the calibration that its weights came with, where that of the scene has taken its
+            place; None where it has not, and where they came with none.
     """
 
     network: RestorationNetwork
@@ -126,6 +131,7 @@ class EmbeddedEnhancer:
     untrained: EmbeddedEnhancer | None = None
     trained_on: str = ""
     seamless: bool = False
+    weights_calibration: Calibration | None = None
 
     name = "embedded"
     follows_keyframes = True
@@ -165,11 +171,19 @@ class EmbeddedEnhancer:
         return replace(
             self,
             record=record,
+            calibration=self.weights_calibration or self.calibration,
+            weights_calibration=None,
             domain_score=None,
             scene_calibrated=False,
             untrained=None,
             seamless=False,
         )
+
+    def with_calibration_of_scene(self, calibration: Calibration) -> EmbeddedEnhancer:
+        """The same restorer; its expected error follows the scene's left-out frames, not its weights' own."""
+        known = self.calibration if self.calibration.predicted else None
+        of_weights = self.weights_calibration if self.scene_calibrated else known
+        return replace(self, calibration=calibration, scene_calibrated=True, weights_calibration=of_weights)
 
     @property
     def keeps_known(self) -> bool:
@@ -372,6 +386,9 @@ class EmbeddedEnhancer:
             "domain": None if self.domain is None else self.domain.as_dict(),
             "domain_score": self.domain_score,
             "scene_calibrated": self.scene_calibrated,
+            "weights_calibration": (
+                None if self.weights_calibration is None else self.weights_calibration.as_dict()
+            ),
             "trained_on": self.trained_on,
             "seamless": self.seamless,
             "record": self.record,
@@ -425,7 +442,7 @@ class EmbeddedEnhancer:
                 Gamut(**description["gamut"]),
                 dict(description["record"]),
                 ErrorModel(tuple(error_model["weights"]), float(error_model["offset"])),
-                Calibration(**{k: tuple(v) for k, v in description["calibration"].items()}),
+                _calibration_from(description["calibration"]),
                 bool(description["deterministic"]),
                 bool(description["drawing"]),
                 _read_patches(weights_file.with_name(PATCHES)),
@@ -436,6 +453,9 @@ class EmbeddedEnhancer:
                 _read_untrained(weights_file.with_name(UNTRAINED)),
                 str(description["trained_on"]),
                 bool(description["seamless"]),
+                None
+                if description["weights_calibration"] is None
+                else _calibration_from(description["weights_calibration"]),
             )
         try:
             network.load_state_dict(
@@ -444,6 +464,10 @@ class EmbeddedEnhancer:
         except (OSError, RuntimeError, ValueError) as error:
             raise WeightsError(f"{weights_file}: not the weights of this network ({error})") from error
         return enhancer
+
+
+def _calibration_from(entries: Mapping[str, Any]) -> Calibration:
+    return Calibration(**{name: tuple(values) for name, values in entries.items()})
 
 
 @cache

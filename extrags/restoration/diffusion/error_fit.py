@@ -34,7 +34,7 @@ def with_calibration(enhancer: EmbeddedEnhancer, restored: RestoredPairs) -> Emb
     calibration = Calibration.fitted(*cell_errors(restored))
     if not calibration.predicted:
         return enhancer
-    return replace(enhancer, calibration=calibration, scene_calibrated=True)
+    return enhancer.with_calibration_of_scene(calibration)
 
 
 def error_over_expected(enhancer: EmbeddedEnhancer, restored: RestoredPairs) -> float | None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import json
 import logging
-import math
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -22,6 +21,7 @@ from torch import Tensor
 
 from extrags.array_files import load_safetensors, save_safetensors
 from extrags.config.base import Seed, StageConfig
+from extrags.config.restorer import LevelWidth
 from extrags.devices import chosen_device
 from extrags.errors import ConfigError, WeightsError
 from extrags.metrics.lpips import Lpips
@@ -66,7 +66,9 @@ class PretrainingConfig(StageConfig):
     iterations: int = Field(13_500, ge=1, description="optimisation steps")
     batch: int = Field(4, ge=1, description="crops per step, each from a scene of its own")
     crop: int = Field(96, ge=32, multiple_of=8, description="side of a crop in pixels")
-    channels: tuple[int, int, int] = Field((48, 96, 160), description="widths of the U-Net's levels")
+    channels: tuple[LevelWidth, LevelWidth, LevelWidth] = Field(
+        (48, 96, 160), description="widths of the U-Net's levels"
+    )
     learning_rate: float = Field(8e-4, gt=0, description="peak, after the warm-up")
     ema_decay: float = Field(0.999, ge=0, lt=1, description="memory of the running mean of the weights")
     perceptual: bool = Field(
@@ -101,8 +103,10 @@ class PretrainingConfig(StageConfig):
     drawing_processes: int = Field(
         0, ge=0, description="processes that cut crops ahead, at most one per scene; 0: a thread does"
     )
-    most_seconds: float = Field(
-        math.inf, gt=0, description="the training ends after this time, however many steps it has made"
+    most_seconds: float | None = Field(
+        None,
+        gt=0,
+        description="the training ends after this time, however many steps it has made; None: after all",
     )
     checkpoint_seconds: float = Field(300, gt=0, description="between two checkpoints")
     seed: Seed = 0
@@ -237,7 +241,7 @@ def _train(
             if checkpoint is not None and now - written > config.checkpoint_seconds:
                 _write(checkpoint, training, config)
                 written = now
-            if now - begun > config.most_seconds:
+            if config.most_seconds is not None and now - begun > config.most_seconds:
                 break
         following.cancel()
     if checkpoint is not None:

@@ -54,12 +54,21 @@ def scene_restorer(
         WeightsError: when the weights are missing or do not fit.
         ConfigError: when there would be neither weights nor training.
     """
+    found = _judged_restorer(scene, sequence, config, coarse)
+    # Of the one that serves: of two sets of weights the judge may prefer the less familiar one.
+    if isinstance(found, EmbeddedEnhancer | ClassicalEnhancer):
+        _tell_domain(found.domain_score)
+    return found
+
+
+def _judged_restorer(
+    scene: Scene, sequence: EndoscopicSequence, config: EnhanceConfig, coarse: CoarseConfig
+) -> Enhancer:
+    """Trained as the settings ask, and compared with the classical one as far as frames can be left out."""
     known = familiar([found.with_domain_score(sequence) for found in pretrained(config)])
     start = known[0] if known else None
     transfer = gather_references(scene, sequence, sequence.train).transfer
     patches = choose_patches(sequence) if start is not None and start.network.generative else None
-    if start is not None:
-        _tell_domain(start)
     if start is not None and config.train_iterations == 0:
         gamut = _scene_gamut(sequence)
         untouched = [_as_asked(restorer.with_settings(config, gamut, patches), config) for restorer in known]
@@ -253,8 +262,7 @@ def _cloning_outside(enhancer: EmbeddedEnhancer, reason: str, cloning: SeamlessC
     return replace(found, record={**found.record, "unjudged": reason})
 
 
-def _tell_domain(enhancer: EmbeddedEnhancer) -> None:
-    score = enhancer.domain_score
+def _tell_domain(score: float | None) -> None:
     if score is None:
         return
     emit(MetricRecorded("enhance", "domain_score", score))

@@ -44,7 +44,9 @@ class HiddenDepthConfig(StageConfig):
         0.1, ge=0, description="of the expected error's likelihood; the error is not used yet"
     )
     completion: str = Field("bundled", description="the depth completion to start from: bundled, or a file")
-    most_seconds: float = Field(math.inf, gt=0, description="the training ends after this time")
+    most_seconds: float | None = Field(
+        None, gt=0, description="the training ends after this time; None: after all steps"
+    )
     seed: Seed = 0
 
 
@@ -110,7 +112,7 @@ def train_hidden_depth(
         config.learning_rate,
         slope_weight=config.slope_weight,
         error_weight=config.error_weight,
-        seconds=config.most_seconds,
+        seconds=math.inf if config.most_seconds is None else config.most_seconds,
     )
     history: list[dict[str, float]] = []
 

@@ -14,11 +14,12 @@ import torch
 from extrags.config import CoarseConfig
 from extrags.depth.hidden import SOLID
 from extrags.errors import ConfigError, WeightsError
+from extrags.events import Event, subscribed
 from extrags.restoration.backends import load_enhancer, train_enhancer
 from extrags.restoration.classical import ClassicalEnhancer
 from extrags.restoration.diffusion import scene_restorer
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
-from extrags.restoration.diffusion.error_fit import cell_errors, error_over_expected
+from extrags.restoration.diffusion.error_fit import cell_errors, error_over_expected, with_calibration
 from extrags.restoration.diffusion.frame_features import sequence_features
 from extrags.restoration.diffusion.scene_restorer import best_of_all, familiar
 from extrags.restoration.diffusion.scene_training import train_on_scene
@@ -367,6 +368,43 @@ class TestEmbedded:
         assert never_trained_on(served) is served
         for name in ("judged", "unjudged", "scene_training_kept"):
             assert served.provenance[name] is None
+
+    def test_weights_have_their_own_calibration_whatever_scene_they_were_saved_for(
+        self, tube_pairs: Pairs, tube: Tube, trained: EmbeddedEnhancer, tmp_path: Path, monkeypatch
+    ) -> None:
+        monkeypatch.setattr(calibration, "MIN_CELLS", 50)
+        sure = replace(trained, calibration=Calibration((0.01, 1.0), (0.001, 0.1)))
+        chosen = validation_pairs(tube_pairs)
+        assert chosen is not None
+        restored = restored_pairs(sure, chosen, tube.references.transfer)
+        # Calibrated twice, as where it clones seamlessly after all.
+        told = with_calibration(with_calibration(sure, restored), restored)
+        assert told.scene_calibrated
+        assert told.calibration != sure.calibration
+        told.save(tmp_path)
+        loaded = EmbeddedEnhancer.load(tmp_path)
+        assert loaded.calibration == told.calibration
+        alone = loaded.without_scene()
+        assert alone.calibration == sure.calibration
+        assert not alone.scene_calibrated
+        assert alone.without_scene() == alone
+
+    def test_the_domain_that_is_told_is_that_of_the_weights_that_serve(
+        self, tube: Tube, trained: EmbeddedEnhancer, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """Not of the most familiar one, where the judge prefers another."""
+        familiar_one = replace(trained, domain_score=1.2)
+        better = replace(trained, domain_score=1.4)
+        monkeypatch.setattr(scene_restorer, "pretrained", lambda _: (familiar_one, better))
+        monkeypatch.setattr(EmbeddedEnhancer, "with_domain_score", lambda self, _: self)
+        monkeypatch.setattr(scene_restorer, "best_of_all", lambda restorers, *_, **__: restorers[1])
+        heard: list[Event] = []
+        config = SMALL.model_copy(update={"train_iterations": 0})
+        with subscribed(heard.append):
+            served = train_enhancer(tube.scene, tube.sequence, config, CoarseConfig())
+        assert isinstance(served, EmbeddedEnhancer)
+        told = [event.value for event in heard if getattr(event, "name", "") == "domain_score"]
+        assert told == [served.domain_score] == [1.4]
 
     def test_validation_pairs_have_valid_pixels(self, tube_pairs: Pairs) -> None:
         chosen = np.flatnonzero(tube_pairs.validation)

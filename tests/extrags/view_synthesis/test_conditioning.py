@@ -12,6 +12,7 @@ from extrags.restoration.clips import render_clips
 from extrags.restoration.training_data.augmentation import cut_out, drop_references
 from extrags.view_synthesis.conditioning import CONDITION_CHANNELS, Layers, condition, observe_views
 from extrags.view_synthesis.gather import gather_references
+from extrags.view_synthesis.references import LightTransfer
 from tests.extrags.lit_tube import HEIGHT, WIDTH, Tube, cast_tube, tube_cameras
 
 
@@ -123,6 +124,17 @@ class TestCondition:
         assert cut.get("uncertainty")[..., 10:25, 20:35].min() == 1
         base = condition(cut, tube.references.transfer).base
         assert base[..., 10:25, 20:35].min() > 0.01
+
+    @pytest.mark.parametrize("faint", [1e-2, 1e-5, 1e-20])
+    def test_faint_evidence_keeps_its_colour(self, layers: Layers, faint: float) -> None:
+        """It is no darker than what is known well: the base image is grey where all that is seen is."""
+        grey, unlit = Layers(layers.data.clone()), LightTransfer(None, 0.0, 10.0)
+        for name in ("rendered", "nearest", "invented", "alpha", "invented_weight", "blend_weight"):
+            grey.get(name).zero_()
+        grey.get("blend").fill_(0.5)
+        grey.get("blend_weight").fill_(faint)[..., :8] = 1
+        base = condition(grey, unlit).base
+        torch.testing.assert_close(base, torch.full_like(base, 0.5), atol=1e-4, rtol=0)
 
     def test_a_hole_may_keep_what_was_invented(self, layers: Layers) -> None:
         before = Layers(layers.data.clone())

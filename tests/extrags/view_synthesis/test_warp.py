@@ -181,6 +181,14 @@ def test_what_is_trusted_less_counts_by_the_square() -> None:
     torch.testing.assert_close(blend, torch.full_like(blend, 0.404), atol=5e-4, rtol=0)
 
 
+@pytest.mark.parametrize("faint", [1e-4, 1e-9, 1e-20])
+def test_however_faint_trust_is_the_blend_is_a_mean(faint: float) -> None:
+    references, depth = _same_place([(0.4, 0.4, 0.4), (0.42, 0.42, 0.42)], [faint, faint / 2])
+    warped = warp_references(references, references.cameras[[0]], depth, count=2)
+    torch.testing.assert_close(warped.blend, torch.full_like(warped.blend, 0.404), atol=5e-4, rtol=0)
+    assert 0 < warped.blend_weight.max() < 1.0
+
+
 def test_a_highlight_is_not_blended() -> None:
     dark, bright = (0.4, 0.4, 0.4), (0.9, 0.9, 0.9)
     references, depth = _same_place([dark, bright, dark, dark], [1.0] * 4)
