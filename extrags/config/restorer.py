@@ -179,7 +179,7 @@ class EnhanceConfig(StageConfig):
         "take longer than the reconstructions they come from, and more of them hardly tell more",
     )
     batch: int = Field(4, ge=1, description="crops per step")
-    crop: int = Field(96, ge=32, multiple_of=8, description="crop size in pixels, a multiple of 8")
+    crop: int = Field(96, ge=32, multiple_of=8, description="crop size in pixels")
     channels: tuple[LevelWidth, LevelWidth, LevelWidth] = Field(
         (32, 64, 96), description="widths of the U-Net's levels, where it starts from no weights"
     )

@@ -118,7 +118,9 @@ class Setting:
             names = ", ".join(map(str, get_args(get_args(kind)[0])))
             return [f"one or more of {names}, with commas between"]
         if get_origin(kind) is tuple:
-            return [f"{len(get_args(kind))} whole numbers with commas between"]
+            parts = get_args(kind)
+            step = _multiple_of(item for field in get_args(parts[0])[1:] for item in field.metadata)
+            return [f"{len(parts)} {f'multiples of {step}' if step else 'whole numbers'} with commas between"]
         if kind in (int, float):
             return [("a whole number" if kind is int else "a number") + self._range()]
         return {bool: ["true", "false"], str: ["text"], NoneType: ["none"]}[kind]
@@ -126,10 +128,16 @@ class Setting:
     def _range(self) -> str:
         words = {"gt": "above", "ge": "of at least", "lt": "below", "le": "at most"}
         limit = {name: getattr(item, name) for name in words for item in self.limits if hasattr(item, name)}
+        step = _multiple_of(self.limits)
+        multiple = f", a multiple of {step}" if step else ""
         if {"ge", "le"} <= set(limit):
-            return f" from {limit['ge']} to {limit['le']}"
+            return f" from {limit['ge']} to {limit['le']}{multiple}"
         parts = [f"{words[name]} {value}" for name, value in limit.items()]
-        return f" {' and '.join(parts)}" if parts else ""
+        return f" {' and '.join(parts)}{multiple}" if parts else multiple
+
+
+def _multiple_of(limits: Iterable[Any]) -> int | None:
+    return next((item.multiple_of for item in limits if hasattr(item, "multiple_of")), None)
 
 
 @cache

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -172,6 +173,8 @@ class TestPretraining:
         enhancer.save(tmp_path, half=True)
         loaded = EmbeddedEnhancer.load(tmp_path / "restorer.safetensors")
         assert loaded.record["pretraining"]["iterations"] == 60
+        # What others than Python read as well: infinity is no number of JSON.
+        json.loads((tmp_path / "restorer.json").read_text(), parse_constant=pytest.fail)
         for one, two in zip(
             loaded.network.state_dict().values(), enhancer.network.state_dict().values(), strict=True
         ):
