@@ -220,7 +220,7 @@ def _intrinsics(sequence: EndoscopicSequence) -> Iterator[Finding]:
 
 def _count(sequence: EndoscopicSequence) -> Iterator[Finding]:
     """Too few frames to train on, or to place where no poses are given."""
-    from extrags.poses.estimate import MIN_TRAINING_FRAMES
+    from extrags.poses.registration_report import MIN_TRAINING_FRAMES
 
     train, test = len(sequence.train), len(sequence.test)
     if sequence.world_from_camera is not None and train == 1:

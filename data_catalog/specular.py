@@ -63,10 +63,9 @@ def specular_mask(
     # Several times as fast as a minimum over the last axis.
     red, green, blue = cv2.split(rgb)
     weakest, strongest = cv2.min(cv2.min(red, green), blue), cv2.max(cv2.max(red, green), blue)
-    median, around = _surroundings(weakest, inside)
-    _, brightest = _surroundings(strongest, inside)
+    (median, around), (_, brightest) = _surroundings((weakest, strongest), inside)
     excess = weakest.astype(np.float32) - around
-    texture = weakest[inside] - median[inside]
+    texture = (weakest - median)[inside]
     spread = 1.4826 * float(np.median(np.abs(texture - np.median(texture))))
     threshold = max(_FLOOR, _DEVIATIONS * spread)
     # Paler than its surroundings: the weakest channel grew by more than the strongest, in proportion.
@@ -99,9 +98,9 @@ def with_specular(sequence: EndoscopicSequence) -> EndoscopicSequence:
 
 
 def _surroundings(
-    channel: UInt8[np.ndarray, "h w"], inside: Bool[np.ndarray, "h w"]
-) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
-    """Median over a window, and the brightest of them nearby.
+    channels: tuple[UInt8[np.ndarray, "h w"], ...], inside: Bool[np.ndarray, "h w"]
+) -> list[tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]]:
+    """Of each channel the median over a window, and the brightest of them nearby.
 
     What lies outside the mask is filled by the nearest inside. Both vary slowly and are found at a small
     size, so that the work does not grow with the image.
@@ -109,22 +108,27 @@ def _surroundings(
     import cv2
     from scipy.ndimage import distance_transform_edt
 
-    height, width = channel.shape
+    height, width = inside.shape
     small_width = min(width, _SURROUNDINGS_WIDTH)
     size = (small_width, max(1, round(height * small_width / width)))
-    small = cv2.resize(channel, size, interpolation=cv2.INTER_AREA)
     # Pixels that the mask cuts count as outside.
     small_inside = cv2.resize(inside.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
     if not small_inside.any():
-        blank = np.full(channel.shape, 255, dtype=np.float32)
-        return blank, blank
+        blank = np.full(inside.shape, 255, dtype=np.float32)
+        return [(blank, blank)] * len(channels)
+    nearest = None
     if not small_inside.all():
         nearest = distance_transform_edt(~small_inside, return_distances=False, return_indices=True)
-        small = np.ascontiguousarray(small[tuple(nearest)])
     window = max(3, round(_WINDOW_SHARE * small_width)) | 1
     nearby = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (window, window))
-    median = cv2.medianBlur(small, window)
-    found = [np.asarray(part, dtype=np.float32) for part in (median, cv2.dilate(median, nearby))]
-    if size != (width, height):
-        found = [cv2.resize(part, (width, height), interpolation=cv2.INTER_LINEAR) for part in found]
-    return found[0], found[1]
+    surroundings = []
+    for channel in channels:
+        small = cv2.resize(channel, size, interpolation=cv2.INTER_AREA)
+        if nearest is not None:
+            small = np.ascontiguousarray(small[tuple(nearest)])
+        median = cv2.medianBlur(small, window)
+        found = [np.asarray(part, dtype=np.float32) for part in (median, cv2.dilate(median, nearby))]
+        if size != (width, height):
+            found = [cv2.resize(part, (width, height), interpolation=cv2.INTER_LINEAR) for part in found]
+        surroundings.append((found[0], found[1]))
+    return surroundings

@@ -1,13 +1,15 @@
 """Which functions have their arguments checked while tests run: those that take or give arrays.
 
-The import hook wraps every function of the packages, whether it has a shape to check or not, and a wrapped
-call binds its arguments anew. What has no arrays is left to mypy, which checks all of it. Of what has, the
-first calls in each process are checked, and one of so many later ones: some functions are called a hundred
-thousand times with the same shapes, and checking all of them took a sixth of the suite's processor time.
+The import hook wraps every function and dataclass of the packages, whether it has a shape to check or not,
+and a wrapped call binds its arguments anew. What has no arrays is left to mypy, which checks all of it. Of
+what has, the first calls in each process are checked, and one of so many later ones: some functions are
+called a hundred thousand times with the same shapes, and checking all of them took a sixth of the suite's
+processor time.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import inspect
 import itertools
@@ -35,6 +37,8 @@ def check_arrays_alone() -> None:
         decorator: Callable[[Any], Any] = wrapped(**given)
 
         def decorated(one: Any) -> Any:
+            if dataclasses.is_dataclass(one) and isinstance(one, type):
+                return of_fields(one, decorator)
             if not inspect.isfunction(one):
                 return decorator(one)
             return sampled(one, decorator) if has_arrays(one) else one
@@ -42,6 +46,15 @@ def check_arrays_alone() -> None:
         return decorated
 
     jaxtyping.jaxtyped = jaxtyped  # type: ignore[assignment]
+
+
+def of_fields(one: type, decorator: Callable[[Any], Any]) -> type:
+    """A dataclass whose `__init__` is checked as functions are; the import hook has every call checked."""
+    init: Any = one.__init__  # type: ignore[misc]
+    # Written by hand or inherited it was decorated before.
+    if "checked" not in vars(init) and has_arrays(init):
+        one.__init__ = sampled(init, decorator)  # type: ignore[misc]
+    return one
 
 
 def sampled(plain: Callable[..., Any], decorator: Callable[[Any], Any]) -> Callable[..., Any]:

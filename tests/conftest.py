@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import functools
 import gc
 import os
 from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import jaxtyping
+import numpy as np
 import pytest
 
 from tests.array_checks import check_arrays_alone
@@ -108,6 +111,33 @@ def one_thread_of_the_kernels() -> None:
 
         if native.native_isa():
             native.set_num_threads(1)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def each_colon_is_built_and_painted_once() -> Iterator[None]:
+    """Anatomy and texture of the last few scenes stay: of a small recording they are half of the work.
+
+    They depend on nothing but what names them here, which `tests.data_catalog.test_phantom` proves. Nobody
+    can write into them.
+    """
+    from data_catalog.phantom import recording
+
+    @functools.lru_cache(maxsize=3)
+    def built(scene: int, polyps: int, variation: float) -> tuple[Any, Any]:
+        config = recording.PhantomConfig(scene=scene, polyps=polyps, variation=variation)
+        wall = build_wall(config)
+        texture = paint(config, wall)
+        for array in (*vars(wall).values(), *vars(wall.center_line).values(), *texture.levels):
+            if isinstance(array, np.ndarray):
+                array.flags.writeable = False
+        return wall, texture
+
+    build_wall, paint = recording.build_wall, recording.paint
+    with (
+        patch.object(recording, "build_wall", lambda of: built(of.scene, of.polyps, of.variation)[0]),
+        patch.object(recording, "paint", lambda of, _: built(of.scene, of.polyps, of.variation)[1]),
+    ):
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -1,11 +1,16 @@
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
-from jaxtyping import Float, TypeCheckError
+from beartype import beartype
+from jaxtyping import Float, TypeCheckError, jaxtyped
 
 from extrags.cameras import Cameras, rotation_about
-from tests.array_checks import FIRST_CALLS, ONE_OF_CALLS, has_arrays, sampled
+from extrags.gaussians import Gaussians
+from extrags.sequence import EndoscopicSequence
+from tests.array_checks import FIRST_CALLS, ONE_OF_CALLS, has_arrays, of_fields, sampled
 
 Pixels = dict[str, Float[np.ndarray, "h w"]]
 
@@ -17,6 +22,20 @@ def of_a_stack(stack: list[Float[np.ndarray, "*n"] | None]) -> None: ...
 
 
 def of_a_result(name: str) -> Float[np.ndarray, "*n"] | None: ...
+
+
+@dataclass(frozen=True)
+class Lines:
+    ends: Float[np.ndarray, "n 3"]
+    width: int
+
+
+of_fields(Lines, jaxtyped(typechecker=beartype))
+
+
+@dataclass(frozen=True)
+class Named:
+    name: str
 
 
 def of_no_array(cameras: Cameras, name: str = "Float") -> dict[str, float]: ...
@@ -34,6 +53,25 @@ def test_a_wrong_shape_is_refused() -> None:
     checked = vars(rotation_about)["checked"]()
     with pytest.raises(TypeCheckError, match="axis"):
         checked(np.zeros(4), 0.1)
+
+
+def test_fields_of_a_wrong_shape_are_refused() -> None:
+    checked = vars(Lines.__init__)["checked"]()
+    checked(object.__new__(Lines), np.zeros((2, 3)), 1)
+    with pytest.raises(TypeCheckError, match="ends"):
+        checked(object.__new__(Lines), np.zeros((2, 4)), 1)
+    # And so are those of the packages.
+    for kind in (Cameras, Gaussians, EndoscopicSequence):
+        assert "checked" in vars(kind.__init__)
+
+
+def test_a_dataclass_without_arrays_and_one_that_was_seen_stay() -> None:
+    before = Lines.__init__
+    assert of_fields(Lines, pytest.fail) is Lines
+    assert Lines.__init__ is before
+    plain = Named.__init__
+    of_fields(Named, pytest.fail)
+    assert Named.__init__ is plain
 
 
 def test_the_first_calls_are_checked_and_one_of_so_many_later_ones() -> None:

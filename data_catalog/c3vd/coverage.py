@@ -93,16 +93,17 @@ def read_coverage_mesh(file: Path) -> CoverageMesh:
     if not np.isfinite(points).all():
         raise SourceError("a vertex holds NaN or infinity", file=file, field="v")
     for index, face in enumerate(corners):
-        if len(face) != 3 or any(corner.count("/") < 1 for corner in face):
+        # Written out: a generator for each of a hundred thousand faces takes four times as long.
+        if len(face) != 3 or "/" not in face[0] or "/" not in face[1] or "/" not in face[2]:
             raise SourceError(
                 f"face {index} is {' '.join(face)!r}; expected three corners as vertex/texture",
                 file=file,
                 field="f",
             )
     try:
-        numbers = np.array(
-            [corner.split("/")[:2] for face in corners for corner in face], dtype=np.int64
-        ).reshape(-1, 3, 2)
+        # Of one flat list, for the same reason.
+        named = [number for face in corners for corner in face for number in corner.split("/", 2)[:2]]
+        numbers = np.array(named, dtype=np.int64).reshape(-1, 3, 2)
     except ValueError as error:
         raise SourceError(f"a face is not made of whole numbers: {error}", file=file, field="f") from error
     triangles, flags = numbers[..., 0] - 1, numbers[:, 0, 1]

@@ -17,7 +17,7 @@ from data_catalog.phantom.recording import record
 from extrags.sequence import EndoscopicSequence
 from tests.data_catalog.layouts import first_frames
 
-SMALL = {"width": 64, "height": 51}
+SMALL = {"width": 64, "height": 51, "supersample": 1}
 
 
 @pytest.fixture(scope="session")

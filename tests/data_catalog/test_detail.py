@@ -95,13 +95,14 @@ def test_one_blurred_frame_does_not_decide() -> None:
     assert detail_size(sequence_of(frames), LIMIT_DB).divisor == 1
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    images = tmp_path / "soft" / "images"
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Frames in a folder that nobody writes into."""
+    images = tmp_path_factory.mktemp("detail") / "soft" / "images"
     images.mkdir(parents=True)
     for index in range(12):
         small = cv2.GaussianBlur(texture(WIDTH, HEIGHT, index), (0, 0), 6)
-        Image.fromarray(small).save(images / f"{index:03d}.png")
+        Image.fromarray(small).save(images / f"{index:03d}.png", compress_level=1)
     return images.parent
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +16,7 @@ from PIL import Image
 from data_catalog.checks import check_depth_scale, check_sequence
 from data_catalog.diagnostics import diagnose
 from data_catalog.inspection import contact_sheet, facts, inspect
-from data_catalog.matches import match_neighbours, pose_support
+from data_catalog.matches import FrameMatches, match_neighbours, pose_support
 from extrags.cameras import invert_poses
 from extrags.config import IngestConfig
 from extrags.errors import PoseError, SourceError, UnknownSequenceError
@@ -46,6 +48,14 @@ class TestRightSources:
         assert "pixels is too small" in finding.sentence
         assert found.facts is None
         assert found.format == "extrags"
+
+    def test_torch_is_not_loaded(self, posed_folder) -> None:
+        """It took two thirds of the time that a look at a source takes."""
+        program = (
+            "import sys; from data_catalog.inspection import inspect; inspect(sys.argv[1]); "
+            "assert 'torch' not in sys.modules"
+        )
+        subprocess.run([sys.executable, "-c", program, str(posed_folder)], check=True)
 
     def test_unknown_names_are_not_findings(self) -> None:
         with pytest.raises(UnknownSequenceError):
@@ -234,6 +244,11 @@ def test_memory_does_not_grow_with_the_frames(clip) -> None:
     assert peaks[1] - peaks[0] < 5 * clip.rgb[0].nbytes
 
 
+@pytest.fixture(scope="module")
+def matches(clip: EndoscopicSequence) -> list[FrameMatches]:
+    return match_neighbours(clip)
+
+
 class TestPoseSupport:
     """Exact poses explain matches; every other reading of them explains clearly fewer."""
 
@@ -246,9 +261,9 @@ class TestPoseSupport:
             (lambda poses: invert_poses(poses) @ np.diag([1.0, -1, -1, 1]), "world-to-camera (inverted)"),
         ],
     )
-    def test_the_reading_is_found(self, clip, change, name) -> None:
+    def test_the_reading_is_found(self, clip, matches, change, name) -> None:
         changed = replace(clip, world_from_camera=change(clip.world_from_camera))
-        support = pose_support(changed, match_neighbours(clip))
+        support = pose_support(changed, matches)
         assert support.matches > 60
         assert support.best > 0.82
         assert support.best_name.startswith(name)

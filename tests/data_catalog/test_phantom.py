@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from data_catalog.phantom.appearance import paint
 from data_catalog.phantom.config import PhantomConfig
 from data_catalog.phantom.geometry import build_wall
 from data_catalog.phantom.imaging import recording_sensor
@@ -18,6 +19,7 @@ from extrags.config import IngestConfig
 from extrags.errors import ConfigError
 from extrags.observed_surface import observed_from_depth
 from extrags.sequence import EndoscopicSequence
+from tests.data_catalog.conftest import SMALL
 
 
 def carried(
@@ -144,10 +146,10 @@ class TestRecordings:
 
     @pytest.mark.parametrize("scene", [0, 4, 11])
     def test_lens_keeps_clear_of_the_wall(self, scene) -> None:
+        wall = build_wall(PhantomConfig(scene=scene))
+        rays = RayCaster(wall.vertices, wall.triangles)
         for setting in ("sparse", "distanced"):
             config = PhantomConfig(scene=scene, setting=setting)
-            wall = build_wall(config)
-            rays = RayCaster(wall.vertices, wall.triangles)
             for recording in ("a", "b"):
                 poses = camera_path(config, wall, rays, recording, np.linspace(0, 1, 100))
                 assert rays.clearance_mm(poses[:, :3, 3]).min() > MIN_CLEARANCE_MM
@@ -162,7 +164,8 @@ class TestRecordings:
 
 
 def thorough(setting: str, **settings: int) -> EndoscopicSequence:
-    config = {"scene": 11, "setting": setting, "width": 40, "height": 32, **settings}
+    small = {"width": 40, "height": 32, "supersample": 1}
+    config = {"scene": 11, "setting": setting, **small, **settings}
     return record(PhantomConfig.model_validate(config), "x")
 
 
@@ -279,7 +282,7 @@ class TestDeterminism:
 
     def test_a_frame_does_not_depend_on_its_company(self, sparse: EndoscopicSequence) -> None:
         """Rendering fewer frames renders the same frames."""
-        few = record(PhantomConfig(scene=0, max_frames=5, width=64, height=51), "x")
+        few = record(PhantomConfig(scene=0, max_frames=5, **SMALL), "x")
         for k in range(len(few)):
             whole = sparse.frame_names.index(few.frame_name(k))
             np.testing.assert_array_equal(few.rgb[k], sparse.rgb[whole])
@@ -288,6 +291,36 @@ class TestDeterminism:
         small = {"width": 48, "height": 40, "max_frames": 2}
         images = [record(PhantomConfig(scene=k, **small), "x").rgb.astype(int) for k in (0, 1)]
         assert np.abs(images[0] - images[1]).mean() > 5
+
+    def test_anatomy_and_texture_depend_on_the_scene_alone(self) -> None:
+        """Neither on what is recorded of it nor how; tests share them."""
+        one = PhantomConfig(scene=4)
+        others = {
+            "setting": "pocket",
+            "width": 40,
+            "height": 32,
+            "field_of_view_deg": 70.0,
+            "supersample": 1,
+            "video_frames": 60,
+            "train_every": 3,
+            "test_frames": 5,
+            "max_frames": 4,
+            "exposure_spread": 0.2,
+            "exposure_drift": 0.1,
+            "white_balance_spread": 0.1,
+            "noise": False,
+            "speculars": False,
+            "shadows": False,
+        }
+        assert set(others) | {"scene", "polyps", "variation"} == set(PhantomConfig.model_fields)
+        other = PhantomConfig.model_validate({"scene": 4, **others})
+        walls = [build_wall(config) for config in (one, other)]
+        for name in ("points", "normals", "along", "crest", "bump"):
+            np.testing.assert_array_equal(getattr(walls[1], name), getattr(walls[0], name))
+        assert walls[0].polyps == walls[1].polyps
+        painted = [paint(config, wall) for config, wall in zip((one, other), walls, strict=True)]
+        for first, second in zip(*(texture.levels for texture in painted), strict=True):
+            np.testing.assert_array_equal(first, second)
 
     def test_anatomy_does_not_depend_on_resolution(self) -> None:
         """Twice the resolution shows the same surface: depth at shared rays is equal."""

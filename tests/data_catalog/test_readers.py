@@ -84,7 +84,7 @@ class TestSinus:
         lines = (folder / name).read_text().split()
         (folder / name).write_text("\n".join(lines * 2))
         if name == "camera_intrinsics_per_view":
-            assert len(read(folder)) == 35
+            assert len(read(folder, IngestConfig(size="thumbnail"))) == 35
         (folder / name).write_text("\n".join(spoilt(lines)))
         with pytest.raises(SourceError, match=problem):
             read(folder)

@@ -28,7 +28,7 @@ Views = tuple[np.ndarray, np.ndarray]
 @pytest.fixture(scope="module")
 def views() -> Views:
     """What a left and a right camera see of a plane, [F, h, w, 3] each."""
-    wide = moving_scene(30, WIDTH + DISPARITY, HEIGHT, speed=2)
+    wide = moving_scene(20, WIDTH + DISPARITY, HEIGHT, speed=2)
     return wide[:, :, DISPARITY:], wide[:, :, :-DISPARITY]
 
 
@@ -131,10 +131,10 @@ class TestAgreement:
         mixed = np.concatenate([dark, elsewhere[:2]])
         assert agreeing_share(zip(np.concatenate([dark, views[0][:2]]), mixed, strict=True)) == 0
 
-    def test_halves_of_single_pictures(self, sparse: EndoscopicSequence) -> None:
+    def test_halves_of_single_pictures(self, clip: EndoscopicSequence) -> None:
         for beside in (True, False):
             halves = BothViews(beside, "left", named=False)
-            assert agreeing_share(halves.both(sparse.rgb[::4])) < 0.1
+            assert agreeing_share(halves.both(clip.rgb)) < 0.1
 
 
 IN_ONE_FOLDER = [
@@ -155,18 +155,18 @@ class TestFrames:
     @pytest.mark.parametrize(("left", "right"), IN_ONE_FOLDER + IN_TWO_FOLDERS)
     def test_those_of_one_camera_are_read(self, tmp_path, views, left, right) -> None:
         """Both were read as one recording: a frame trained where its twin was held out."""
-        write(tmp_path, left, views[0][:10])
-        write(tmp_path, right, views[1][:10])
+        write(tmp_path, left, views[0][:6])
+        write(tmp_path, right, views[1][:6])
         for config, camera, shown in ((IngestConfig(), "left", views[0]), (RIGHT, "right", views[1])):
             sequence = read(tmp_path, config)
-            assert np.array_equal(sequence.rgb, shown[:10])
+            assert np.array_equal(sequence.rgb, shown[:6])
             assert sequence.stereo_camera == camera
             assert facts(sequence)["stereo_camera"] == camera
             found = glance(tmp_path, config)
             assert found is not None
-            assert found.train + found.test == 10
+            assert found.train + found.test == 6
             (sentence,) = stereo_findings(tmp_path, config)
-            assert f"those of the {camera} camera are read, 10 as " in sentence
+            assert f"those of the {camera} camera are read, 6 as " in sentence
             assert "ingest.stereo_camera" in sentence
 
     def test_it_counts_in_cache_keys(self, tmp_path, views) -> None:
@@ -303,7 +303,7 @@ class TestFootage:
         ("spoilt", "problem"),
         [
             (lambda view, other: other, "0% of the frames that were looked at show the same place"),
-            (lambda view, other: view[:20], "30 and 20 frames"),
+            (lambda view, other: view[:12], "20 and 12 frames"),
             (lambda view, other: np.ascontiguousarray(view[:, :64]), "96 x 78 and 96 x 64 pixels"),
         ],
     )

@@ -7,25 +7,43 @@ from functools import cache
 
 import numpy as np
 
-from data_catalog import read
+from data_catalog.phantom.config import PhantomConfig
+from data_catalog.phantom.imaging import recording_sensor
+from data_catalog.phantom.recording import EVALUATES, Phantom
+from data_catalog.specular import with_specular
 from extrags.cameras import pixel_rays
-from extrags.config import IngestConfig
 from extrags.sequence import EndoscopicSequence, Split
+
+NUMBERS = np.round(np.linspace(0, 27, 23)).astype(int)
+"""Of the frames of a recording that a source of at most forty frames has."""
 
 
 def withheld_phantom(frames: int = 10, *, width: int = 96, height: int = 72) -> EndoscopicSequence:
-    """The last frames of a recording train and have no depth, those before are held out and keep theirs."""
-    whole = recorded(width, height)
-    assert whole.recording is not None
-    stretch = np.flatnonzero(whole.recording == whole.recording[-1])[:frames]
-    others = np.setdiff1d(np.arange(len(whole)), stretch)
-    return replace(whole, split=Split("stretch", stretch, others)).without_training_depth()
+    """The first frames of a recording train and have no depth; its last one is held out and keeps its own."""
+    return recorded(frames, width, height).without_training_depth()
 
 
 @cache
-def recorded(width: int, height: int) -> EndoscopicSequence:
-    """Rendered once a process; nobody writes into it."""
-    return read("phantom/0@sparse", IngestConfig(width=width, height=height, max_frames=40))
+def recorded(frames: int, width: int, height: int) -> EndoscopicSequence:
+    """Rendered once a process, and no other frame with them; nobody writes into it."""
+    config = PhantomConfig(scene=0, width=width, height=height)
+    phantom = Phantom(config)
+    sensor = recording_sensor(config, EVALUATES, phantom.scene_gain())
+    numbers = [*NUMBERS[:frames].tolist(), int(NUMBERS[-1])]
+    cameras = phantom.cameras("a", np.array(numbers) / (config.test_frames - 1))
+    images = [phantom.photograph(cameras[k], sensor, EVALUATES, number) for k, number in enumerate(numbers)]
+    depth = np.stack([phantom.z_depth(cameras[k]) for k in range(len(cameras))])
+    sequence = EndoscopicSequence(
+        name="phantom/0@stretch",
+        rgb=np.stack([image for image, _ in images]),
+        K=cameras.K,
+        mask=np.isfinite(depth),
+        split=Split("stretch", np.arange(frames), np.array([frames])),
+        world_from_camera=cameras.world_from_camera,
+        depth_mm=np.where(np.isfinite(depth), depth, 0).astype(np.float32),
+        metric=True,
+    )
+    return with_specular(sequence)
 
 
 def true_training_depth(sequence: EndoscopicSequence) -> np.ndarray:

@@ -315,8 +315,7 @@ def test_a_scope_that_only_turns(
 def test_poses_that_parallax_hardly_tells_come_with_a_warning(
     run: Run, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    complete = estimate_module._run(estimate_module._job(run.sequence, CONFIG), "arc")
-    monkeypatch.setattr(estimate_module, "_run", lambda *_: complete)
+    monkeypatch.setattr(estimate_module, "_run", lambda *_: run.raw)
     estimate_poses(run.sequence, CONFIG)
     assert "sideways motion" not in caplog.text
     monkeypatch.setattr(registration_report, "LITTLE_PARALLAX_DEG", 90.0)

@@ -45,8 +45,15 @@ def room() -> EndoscopicSequence:
 
 
 @pytest.fixture(scope="module")
-def found(room: EndoscopicSequence) -> PoseEstimate:
-    return estimate_poses(guessed(room), CONFIG)
+def found_with_events(room: EndoscopicSequence) -> tuple[PoseEstimate, list[Event]]:
+    events: list[Event] = []
+    with subscribed(events.append):
+        return estimate_poses(guessed(room), CONFIG), events
+
+
+@pytest.fixture(scope="module")
+def found(found_with_events: tuple[PoseEstimate, list[Event]]) -> PoseEstimate:
+    return found_with_events[0]
 
 
 def seen_through(lens: Lens, room: EndoscopicSequence) -> EndoscopicSequence:
@@ -76,12 +83,11 @@ class TestFocalLength:
         assert abs(calibration.focal_px - TRUE_FOCAL_PX) < 4 * calibration.focal_std_px
         assert found.registered.all()
 
-    def test_progress_goes_on_while_lenses_are_fitted(self, room: EndoscopicSequence) -> None:
+    def test_progress_goes_on_while_lenses_are_fitted(
+        self, room: EndoscopicSequence, found_with_events: tuple[PoseEstimate, list[Event]]
+    ) -> None:
         """On long recordings that takes minutes, in which nothing else would be heard."""
-        events: list[Event] = []
-        with subscribed(events.append):
-            estimate_poses(guessed(room), CONFIG)
-        steps = [event for event in events if isinstance(event, Progress)]
+        steps = [event for event in found_with_events[1] if isinstance(event, Progress)]
         fit = FITTED_STEPS * len(room.train)
         jumps = np.diff([step.done for step in steps])
         assert (jumps == fit).sum() >= USUAL_FITS - 1

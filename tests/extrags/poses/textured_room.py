@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
 
 import numpy as np
@@ -83,10 +84,14 @@ def render_room(cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:
     return (colors * 255).round().astype(np.uint8), depth
 
 
+@functools.cache
 def wall_texture(seed: int) -> np.ndarray:
+    """Made once a process: each rendering takes six, and they are most of what it costs."""
     rng = np.random.default_rng(seed)
     texture = np.zeros((TEXELS, TEXELS, 3))
     for sigma, weight in ((2.0, 0.5), (5.0, 0.7), (14.0, 1.0)):
         noise = gaussian_filter(rng.normal(size=(TEXELS, TEXELS, 3)), (sigma, sigma, 0))
         texture += weight * noise / noise.std()
-    return np.clip(0.5 + 0.16 * texture, 0, 1)
+    texture = np.clip(0.5 + 0.16 * texture, 0, 1)
+    texture.flags.writeable = False
+    return texture
