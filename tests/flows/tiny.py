@@ -7,7 +7,7 @@ import functools
 import json
 import ssl
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -17,9 +17,7 @@ import numpy as np
 
 import data_catalog.phantom.recording
 import extrags.metrics.surface
-from data_catalog.phantom.appearance import paint
 from data_catalog.phantom.config import PhantomConfig
-from data_catalog.phantom.geometry import build_wall
 from extrags.config import PipelineConfig, profile_config
 from extrags.sequence import EndoscopicSequence
 from flows.runners import DirectRunner
@@ -104,26 +102,13 @@ def tiny_config(**overrides: Any) -> PipelineConfig:
     return profile_config("quick").with_overrides({**TINY, **more})
 
 
-def once_of_a_scene(make: Callable[..., Any]) -> Callable[..., Any]:
-    """What depends on nothing but the scene, its polyps and its variation is made once for all recordings."""
-    made: dict[tuple[Any, ...], Any] = {}
-
-    def known(config: PhantomConfig, *made_before: Any) -> Any:
-        key = (config.scene, config.polyps, config.variation)
-        if key not in made:
-            made[key] = make(config, *made_before)
-        return made[key]
-
-    return known
-
-
 @contextmanager
 def spared() -> Iterator[None]:
     """Most of what a tiny run would cost, and what other packages prove, is not paid for by every run.
 
-    A process makes each phantom once, renders each of its recordings once, draws equal pictures of reports
-    once, and reads certificates for its clients once, none of which goes beyond this machine; surfaces are
-    fused at a third of the usual resolution, and compared at a tenth of the usual samples.
+    A process renders each phantom once, draws equal pictures of reports once, and reads the certificates of
+    its clients once, none of which goes beyond this machine; surfaces are fused at a third of the usual
+    resolution, and compared at a tenth of the usual samples.
     """
     rendered = functools.cache(data_catalog.phantom.recording.record)
     coarse = extrags.metrics.surface.FUSED_WHOLE.model_copy(update={"voxel_share": 1 / 32})
@@ -134,8 +119,6 @@ def spared() -> Iterator[None]:
 
     with (
         patch.object(data_catalog.phantom.recording, "record", record),
-        patch.object(data_catalog.phantom.recording, "build_wall", once_of_a_scene(build_wall)),
-        patch.object(data_catalog.phantom.recording, "paint", once_of_a_scene(paint)),
         patch.object(extrags.metrics.surface, "N_SAMPLES", 3000),
         patch.object(extrags.metrics.surface, "FUSED_WHOLE", coarse),
         patch.object(ssl, "create_default_context", functools.cache(ssl.create_default_context)),
