@@ -1,8 +1,8 @@
 """Calibration files of endoscopes (OpenCV, Kalibr, Scaramuzza), which take the place of a source's own lens.
 
 * OpenCV: YAML, XML or JSON of `cv::FileStorage` with `camera_matrix` and `distortion_coefficients` (0, 4, 5,
-  8 or more numbers; with 4 and `fisheye_model: 1`, or a `distortion_model` or `camera_model` that says so,
-  the Kannala-Brandt fisheye), and `image_width` and `image_height`, or `image_size` with both, without which
+  8 or more numbers; with 4 and `fisheye_model: 1`, or a `distortion_model`, `camera_model`,
+  `calibration_model`, `lens_model` or `projection_model` that says so, the Kannala-Brandt fisheye), and `image_width` and `image_height`, or `image_size` with both, without which
   the calibration holds for the images as they are. Numbers are a matrix of OpenCV's, a plain list, or what
   ROS writes (`rows`, `cols`, `data`).
 * Kalibr: the `camchain.yaml` with the camera `cam0`: pinhole with radtan, equidistant, fov or no distortion.
@@ -28,7 +28,7 @@ import numpy as np
 from data_catalog.c3vd.pinhole import PinholeResampling, own_pixels
 from data_catalog.c3vd.scaramuzza import ScaramuzzaCamera, camera_from_json
 from data_catalog.file_storage import read_file_storage
-from data_catalog.lens_entries import lens_kind, tells_distortion
+from data_catalog.lens_entries import check_without_mirror, lens_kind, tells_distortion
 from data_catalog.posed_frames import SourceFrames
 from data_catalog.sampling import CameraModel, LensSampling, Sampling
 from extrags.config import IngestConfig
@@ -46,7 +46,7 @@ LENS_OF_POSES = (
 )
 """Why the lens of a source stays whose poses are of structure from motion."""
 
-CALIBRATION_VERSION = 4
+CALIBRATION_VERSION = 5
 """Raised by hand whenever the same file gives another camera."""
 
 _PROPORTION_TOLERANCE = 0.005
@@ -214,6 +214,7 @@ def _opencv(text: str, width: int, height: int, file: Path) -> _Described:
     storage = read_file_storage(text, file, (*_OPENCV_NAMES["K"], *_OPENCV_NAMES["D"]))
     K, D = (_matrix(storage, name, file) for name in ("K", "D"))
     width, height = _size(storage, file) or (width, height)
+    check_without_mirror(storage, file=file)
     fisheye = _is_fisheye(storage, file)
     if K is None or K.size != 9:
         raise SourceError("expected a matrix of 3 x 3 numbers", file=file, field="camera_matrix")

@@ -261,7 +261,7 @@ def _footage(place: Path, config: IngestConfig) -> Footage:
 
 READER = FolderReader(
     name="dicom",
-    version=7,
+    version=8,
     summary="a DICOM multi-frame file (dcm), optionally with intrinsics.json and mask.png beside it",
     recognises=_recognises,
     files=_files,

@@ -182,7 +182,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
 
 READER = FolderReader(
     name="transforms",
-    version=6,
+    version=7,
     summary=f"{TRANSFORMS_FILE} of nerfstudio or instant-ngp, described in "
     "data_catalog/readers/transforms_json.py",
     recognises=_recognises,

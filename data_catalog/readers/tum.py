@@ -131,7 +131,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
 
 READER = FolderReader(
     name="tum",
-    version=1,
+    version=2,
     summary=f"{_COLOUR} with {_POSES} or {_DEPTH} of TUM's RGB-D layout, described in "
     "data_catalog/readers/tum.py",
     recognises=_recognises,

@@ -483,3 +483,79 @@ class TestInPlaceOfStatedIntrinsics:
         config = IngestConfig(calibration=str(file))
         (finding,) = [item for item in inspect(posed_folder, config).findings if item.topic == "calibration"]
         assert "px apart in the median over the image" in finding.sentence
+
+
+class TestOtherModels:
+    """Lenses whose terms would be taken for those of a pinhole with distortion."""
+
+    @pytest.mark.parametrize(
+        "told",
+        [
+            {"xi": 1.2},
+            {"xi": {"rows": 1, "cols": 1, "data": [1.2]}},
+            {"mirror_parameters": {"xi": 1.2}},
+        ],
+        ids=str,
+    )
+    def test_a_mirror_is_refused(self, tmp_path, told) -> None:
+        content = {"camera_matrix": K.tolist(), "distortion_coefficients": [-0.05, 0.02, 0, 0]}
+        (tmp_path / "a.json").write_text(json.dumps({**content, **told}))
+        with pytest.raises(SourceError, match="unified omnidirectional model") as caught:
+            read_calibration(tmp_path / "a.json", WIDTH, HEIGHT)
+        assert caught.value.field == next(iter(told))
+        assert caught.value.file == str(tmp_path / "a.json")
+
+    def test_in_opencvs_own_files(self, tmp_path) -> None:
+        file = opencv_file(tmp_path / "a.xml", [-0.05, 0.02, 0, 0])
+        file.write_text(file.read_text().replace("</opencv_storage>", "<xi>1.2</xi></opencv_storage>"))
+        with pytest.raises(SourceError, match=r"unified omnidirectional model"):
+            read_calibration(file, WIDTH, HEIGHT)
+
+    def test_without_a_mirror_it_is_a_pinhole(self, tmp_path) -> None:
+        """With a parameter of zero the model is that of OpenCV's pinhole."""
+        content = {"camera_matrix": K.tolist(), "distortion_coefficients": [-0.05, 0.02, 0, 0]}
+        (tmp_path / "a.json").write_text(json.dumps({**content, "xi": 0.0, "mirror_parameters": {"xi": 0}}))
+        assert read_calibration(tmp_path / "a.json", WIDTH, HEIGHT).model == "OPENCV"
+
+    @pytest.mark.parametrize("name", ["calibration_model", "lens_model", "projection_model"])
+    def test_names_of_the_model(self, tmp_path, name) -> None:
+        content = {"camera_matrix": K.tolist(), "distortion_coefficients": [0.03, -0.01, 0.004, -0.001]}
+        file = tmp_path / "a.json"
+        file.write_text(json.dumps({**content, name: "fisheye"}))
+        assert read_calibration(file, WIDTH, HEIGHT).model == "OPENCV_FISHEYE"
+        file.write_text(json.dumps({**content, name: {"type": "fisheye", "version": 2}}))
+        assert read_calibration(file, WIDTH, HEIGHT).model == "OPENCV_FISHEYE"
+        file.write_text(json.dumps({**content, name: "pinhole"}))
+        assert read_calibration(file, WIDTH, HEIGHT).model == "OPENCV"
+        for other in ("orthographic", "omnidir", "MEI"):
+            file.write_text(json.dumps({**content, name: other}))
+            with pytest.raises(SourceError, match=f"field {name}: found '{other}'"):
+                read_calibration(file, WIDTH, HEIGHT)
+
+    def test_a_product_is_no_model(self, tmp_path) -> None:
+        content = {"camera_matrix": K.tolist(), "distortion_coefficients": [-0.2, 0.05, 0, 0]}
+        file = tmp_path / "a.json"
+        file.write_text(json.dumps({**content, "lens_model": "Olympus WA50013A"}))
+        assert read_calibration(file, WIDTH, HEIGHT).model == "OPENCV"
+        for name in ("calibration_model", "projection_model"):
+            file.write_text(json.dumps({**content, name: "mapping 7"}))
+            with pytest.raises(SourceError, match=f"field {name}: found 'mapping 7'"):
+                read_calibration(file, WIDTH, HEIGHT)
+
+    @pytest.mark.parametrize(
+        ("told", "problem"),
+        [
+            ({"xi": 1.2}, "field xi: .*unified omnidirectional model"),
+            ({"projection_model": "fisheye"}, "field projection_model: .*expected a pinhole"),
+            ({"lens_model": "opencv_fisheye"}, "field lens_model: .*expected a pinhole"),
+            ({"calibration_model": "something"}, "field calibration_model: .*expected a pinhole"),
+        ],
+    )
+    def test_beside_plain_frames(self, tmp_path, told, problem) -> None:
+        (tmp_path / "intrinsics.json").write_text(json.dumps({"K": K.tolist(), **told}))
+        with pytest.raises(SourceError, match=problem):
+            frames_folder.read_intrinsics(tmp_path, WIDTH, HEIGHT)
+        (tmp_path / "intrinsics.json").write_text(
+            json.dumps({"K": K.tolist(), "xi": 0, next(iter(told)): None})
+        )
+        np.testing.assert_array_equal(frames_folder.read_intrinsics(tmp_path, WIDTH, HEIGHT), K)
