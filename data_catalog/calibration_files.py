@@ -2,9 +2,10 @@
 
 * OpenCV: YAML, XML or JSON of `cv::FileStorage` with `camera_matrix` and `distortion_coefficients` (0, 4, 5,
   8 or more numbers; with 4 and `fisheye_model: 1`, or a `distortion_model`, `camera_model`,
-  `calibration_model`, `lens_model` or `projection_model` that says so, the Kannala-Brandt fisheye), and `image_width` and `image_height`, or `image_size` with both, without which
-  the calibration holds for the images as they are. Numbers are a matrix of OpenCV's, a plain list, or what
-  ROS writes (`rows`, `cols`, `data`).
+  `calibration_model`, `lens_model` or `projection_model` that says so, the Kannala-Brandt fisheye), and
+  `image_width` and `image_height`, or `image_size` with both, without which the calibration holds for the
+  images as they are. Numbers are a matrix of OpenCV's, a plain list, or what ROS writes (`rows`, `cols`,
+  `data`). A mirror's parameter `xi` is refused, unless it is 0.
 * Kalibr: the `camchain.yaml` with the camera `cam0`: pinhole with radtan, equidistant, fov or no distortion.
 * Scaramuzza: `calib_results.txt` of OCamCalib, a polynomial of fourth degree.
 

@@ -103,8 +103,8 @@ def check_without_mirror(entries: Mapping[str, Any], *, file: Path, frame: objec
     for name, value in entries.items():
         if tells_mirror(name, value):
             problem = (
-                f"{_shown(value)}; this is the unified omnidirectional model (Mei; cv::omnidir), which is not "
-                "known here; expected a calibration as a pinhole with distortion, a fisheye or OCamCalib's"
+                f"{_shown(value)}; this is the unified omnidirectional model (Mei; cv::omnidir), not known "
+                "here; expected a calibration as a pinhole with distortion, a fisheye or OCamCalib's"
             )
             raise SourceError(problem, file=file, frame=frame, field=name)
 

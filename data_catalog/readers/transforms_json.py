@@ -1,17 +1,22 @@
 """Reader and writer of `transforms.json`, the format of nerfstudio and instant-ngp.
 
 Read: `transform_matrix` (camera to world, OpenGL axes: y up, z backward; turned to OpenCV's on reading and
-nothing else), `fl_x`, `fl_y` or `camera_angle_x`, `camera_angle_y`, `cx`, `cy`, `w`, `h`, `k1` to `k4`, `p1`,
-`p2`, `camera_model` or `is_fisheye`, each for all frames or in a frame of its own; `file_path` (its suffix
-may be missing; frames without a file are left out, with a warning), `mask_path` (white is tissue),
-`depth_file_path` (of frames without one, or whose file is absent, depth is unknown, with a warning);
+nothing else), `fl_x`, `fl_y` (pixels), `x_fov`, `y_fov` (degrees) or `camera_angle_x`, `camera_angle_y`
+(radians; where one axis has none of the three, it has the focal length of the other), `cx`, `cy`, `w`, `h`,
+`k1` to `k4`, `p1`, `p2`, `camera_model` or `is_fisheye`, each for all frames or in a frame of its own;
+`file_path` (its suffix may be missing; frames without a file are left out, with a warning), `mask_path`
+(white is tissue), `depth_file_path` or `depth_path` (of frames without one, or whose file is absent, depth is
+unknown, with a warning);
 `train_filenames`, `test_filenames` and `val_filenames` (frames in none of them are left out); `ply_file_path`
 (points that are not finite are left out, with a warning). A `null` is as good as no value. Other keys are
 passed over; a warning names those that look misspelt or tell of distortion. Images of distorted cameras are
-resampled to a pinhole; a term of distortion that the camera's model has not is refused, unless it is 0.
+resampled to a pinhole; a term of distortion that the camera's model has not is refused, unless it is 0; so
+are instant-ngp's other cameras (`ftheta_p0` to `ftheta_p4`, `latlong`, `equirectangular`).
 
 Depth is z-depth; a value times `depth_unit_scale_factor` is in the unit of the poses. Where the file does not
-say, that is nerfstudio's 0.001 (or, for integers, instant-ngp's `integer_depth_scale`). 0 is unknown.
+say, that is nerfstudio's 0.001 (or, for integers, instant-ngp's `integer_depth_scale`). Files that
+`depth_path` names, instant-ngp's key, are read where instant-ngp reads them: with an `integer_depth_scale`
+above 0 (or that factor), and without `enable_depth_loading: false`. 0 is unknown.
 
 Lengths: `length_unit` (a key of ours: `mm`, `m` or `arbitrary`) says what a pose's 1 is; without it the scale
 is arbitrary. instant-ngp's `scale`, `offset` and `aabb_scale` and nerfstudio's `applied_transform` say how a
@@ -44,7 +49,14 @@ from data_catalog.pose_conventions import OPENGL
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from data_catalog.readers.beside_frames import frames_among, listed_files, tell_about_folders
 from data_catalog.readers.frame_list import listed_split, load_frame_list, matrix_of, present_frames
-from data_catalog.readers.transforms_lens import DISTORTION_KEYS, StatedLens
+from data_catalog.readers.transforms_depth import (
+    DEPTH_FILE_KEYS,
+    DEPTH_KEYS,
+    NERFSTUDIO_DEPTH_SCALE,
+    depth_factor,
+    depth_files,
+)
+from data_catalog.readers.transforms_lens import DISTORTION_KEYS, FOCAL_KEYS, StatedLens, stated_values
 from data_catalog.readers.unknown_keys import warn_of_unknown_keys
 from extrags.array_files import load_ply_vertices
 from extrags.config import IngestConfig
@@ -58,21 +70,19 @@ logger = logging.getLogger(__name__)
 
 TRANSFORMS_FILE = "transforms.json"
 _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-_NERFSTUDIO_DEPTH_SCALE = 1e-3
 _MM_PER_UNIT = {"mm": 1.0, "m": 1000.0, "arbitrary": 1.0}
-_FILE_KEYS = ("file_path", "mask_path", "depth_file_path")
+_FILE_KEYS = ("file_path", "mask_path", *DEPTH_FILE_KEYS)
 
 _KEYS = (
-    *("frames", "transform_matrix", "length_unit", "depth_unit_scale_factor", "integer_depth_scale"),
+    *("frames", "transform_matrix", "length_unit", *DEPTH_KEYS),
     *("train_filenames", "test_filenames", "val_filenames", "ply_file_path", *_FILE_KEYS),
-    *("camera_model", "is_fisheye", "fl_x", "fl_y", "cx", "cy", "w", "h", *DISTORTION_KEYS),
-    *("camera_angle_x", "camera_angle_y"),
+    *("camera_model", "is_fisheye", "cx", "cy", "w", "h", *FOCAL_KEYS, *DISTORTION_KEYS),
 )
 """What is read, of all frames or of one."""
 _OTHER_KEYS = (
     *("scale", "offset", "aabb_scale", "applied_transform", "applied_scale", "orientation_override"),
     # Of a rolling shutter; the matrix of the frame as a whole stands beside them.
-    *("transform_matrix_start", "transform_matrix_end", "depth_path", "normal_file_path"),
+    *("transform_matrix_start", "transform_matrix_end", "normal_file_path"),
     *("lidar_file_path", "event_file_path", "thermal_file_path", "camera_id", "n_frames", "split_filenames"),
 )
 """What programs write, what changes nothing here, and is spelt like a key that does."""
@@ -138,7 +148,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     used = present & splits.keys() if splits else present
     entries = [entry for entry in listed if entry["file_path"] in used]
     folders = sorted({str(Path(entry["file_path"]).parent) for entry in entries}, key=natural_key)
-    depth_files = _depth_files(folder, entries)
+    depth_file_of = depth_files(content, entries, file)
     frames = []
     for entry in entries:
         frame = entry["file_path"]
@@ -147,10 +157,10 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
             PosedFrame(
                 name=str(Path(frame).relative_to("images")) if frame.startswith("images/") else frame,
                 file=place,
-                lens=StatedLens({**content, **entry}, file, frame).lens(place),
+                lens=StatedLens(stated_values(content, entry), file, frame).lens(place),
                 world_from_camera=_pose(entry, scale, file, frame),
                 mask_file=_mask_file(folder, entry, frame),
-                depth_file=depth_files[frame],
+                depth_file=depth_file_of[frame],
                 recording=folders.index(str(Path(frame).parent)),
                 split=splits.get(frame),
             )
@@ -165,7 +175,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     points, points_rgb = _points(folder, content, file)
 
     def depth_of(depth_file: Path, frame: str | int) -> Float[np.ndarray, "h w"]:
-        factor = _depth_factor(content, depth_file, file) * scale
+        factor = depth_factor(content, depth_file, file) * scale
         return (read_depth(depth_file, frame=frame) * factor).astype(np.float32)
 
     return SourceFrames(
@@ -236,7 +246,7 @@ def write_transforms(
             place = folder / entry["depth_file_path"]
             place.parent.mkdir(parents=True, exist_ok=True)
             # In double precision, so that only the reader rounds.
-            np.save(place, sequence.depth_mm[index].astype(np.float64) / _NERFSTUDIO_DEPTH_SCALE)
+            np.save(place, sequence.depth_mm[index].astype(np.float64) / NERFSTUDIO_DEPTH_SCALE)
         frames.append({**entry, "transform_matrix": pose.tolist()})
     content: dict[str, Any] = {
         "camera_model": "PINHOLE" if sequence.lens is None else "OPENCV_FISHEYE",
@@ -244,6 +254,8 @@ def write_transforms(
         "frames": frames,
     }
     if sequence.lens is not None:
+        # nerfstudio goes by `camera_model`, and instant-ngp by this.
+        content["is_fisheye"] = True
         content |= dict(zip(("k1", "k2", "k3", "k4"), sequence.lens.coefficients, strict=True))
     if len(sequence.test):
         # nerfstudio evaluates on `val` while it trains and on `test` afterwards, and fails where a list is
@@ -307,21 +319,6 @@ def _mask_file(folder: Path, entry: dict[str, Any], frame: str) -> Path | None:
     return file
 
 
-def _depth_files(folder: Path, entries: list[dict[str, Any]]) -> dict[str, Path | None]:
-    """Depth of each frame, by its `file_path`; None where it names none, or one that is absent.
-
-    Raises:
-        SourceNotFoundError: all that are named are absent.
-    """
-    named = {entry["file_path"]: _beside(folder, entry, "depth_file_path") for entry in entries}
-    found = {frame: file if file is not None and file.is_file() else None for frame, file in named.items()}
-    if not any(found.values()):
-        for frame, file in named.items():
-            if file is not None:
-                raise SourceNotFoundError("no such file", file=file, frame=frame, field="depth_file_path")
-    return found
-
-
 def _pose(entry: dict[str, Any], scale: float, file: Path, frame: str) -> Float[np.ndarray, "4 4"]:
     rows = entry.get("transform_matrix")
     if isinstance(rows, list) and len(rows) == 3:
@@ -330,22 +327,6 @@ def _pose(entry: dict[str, Any], scale: float, file: Path, frame: str) -> Float[
     pose = matrix @ _OPENCV_FROM_OPENGL
     pose[:3, 3] *= scale
     return pose
-
-
-def _depth_factor(content: dict[str, Any], depth_file: Path, file: Path) -> float:
-    if "depth_unit_scale_factor" in content:
-        key = "depth_unit_scale_factor"
-    elif "integer_depth_scale" in content and depth_file.suffix.lower() != ".npy":
-        key = "integer_depth_scale"
-    else:
-        return _NERFSTUDIO_DEPTH_SCALE
-    try:
-        factor = float(content[key])
-    except (OverflowError, TypeError, ValueError) as error:
-        raise SourceError(f"{content[key]!r}; expected a number", file=file, field=key) from error
-    if not np.isfinite(factor) or factor <= 0:
-        raise SourceError(f"{factor:g}; expected a positive number", file=file, field=key)
-    return factor
 
 
 def _splits(content: dict[str, Any], file: Path) -> dict[str, Literal["train", "test"]]:
