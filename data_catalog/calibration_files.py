@@ -29,7 +29,7 @@ import numpy as np
 from data_catalog.c3vd.pinhole import PinholeResampling, own_pixels
 from data_catalog.c3vd.scaramuzza import ScaramuzzaCamera, camera_from_json
 from data_catalog.file_storage import read_file_storage
-from data_catalog.lens_entries import check_without_mirror, lens_kind, tells_distortion
+from data_catalog.lens_entries import SIZE_NAMES, check_without_mirror, lens_kind, tells_distortion
 from data_catalog.posed_frames import SourceFrames
 from data_catalog.sampling import CameraModel, LensSampling, Sampling
 from extrags.config import IngestConfig
@@ -59,9 +59,7 @@ _OPENCV_NAMES = {
         *("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "dist_coeffs", "dist_coeff"),
         *("distortion_coeffs", "distortion", "dist", "D"),
     ),
-    "width": ("image_width", "image_Width", "imageWidth"),
-    "height": ("image_height", "image_Height", "imageHeight"),
-    "size": ("image_size", "imageSize", "image_Size", "img_size"),
+    **SIZE_NAMES,
 }
 _MODEL = "distortion_model"
 _OPENCV_COUNTS = (0, 4, 5, 8, 12, 14)

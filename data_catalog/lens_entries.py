@@ -17,6 +17,7 @@ import numpy as np
 from extrags.errors import SourceError
 
 __all__ = [
+    "SIZE_NAMES",
     "LensKind",
     "check_pinhole",
     "check_without_mirror",
@@ -29,6 +30,13 @@ __all__ = [
 LensKind = Literal["pinhole", "polynomial", "fisheye"]
 """`pinhole`: undistorted, or nothing is said of distortion; `polynomial`: OpenCV's radial and tangential
 terms, a pinhole where all are zero; `fisheye`: Kannala and Brandt's, no pinhole whatever its terms."""
+
+SIZE_NAMES = {
+    "width": ("image_width", "image_Width", "imageWidth"),
+    "height": ("image_height", "image_Height", "imageHeight"),
+    "size": ("image_size", "imageSize", "image_Size", "img_size"),
+}
+"""What programs call width and height of the images that were calibrated with, and both in one entry."""
 
 _DISTORTION = re.compile(r"(?<!un)distort|dist_?coef|^(lens_?)?dist$", re.IGNORECASE)
 _TERM = re.compile(r"[kp][1-6]")

@@ -106,7 +106,9 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
             file=folder / INTRINSICS_FILE,
             field="K",
         )
-    K = read_intrinsics(folder, width, height, is_used=config.calibration is None)
+    K = read_intrinsics(
+        folder, width, height, is_used=config.calibration is None, images=colours[0].file.parent
+    )
     lens, mask_file = Lens.pinhole(K, width, height), mask_beside(folder)
     if mask_file is None:
         tell_about_folders(folder, "mask", f"one {MASK_FILE} holds for all frames")
