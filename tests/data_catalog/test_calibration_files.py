@@ -559,3 +559,43 @@ class TestOtherModels:
             json.dumps({"K": K.tolist(), "xi": 0, next(iter(told)): None})
         )
         np.testing.assert_array_equal(frames_folder.read_intrinsics(tmp_path, WIDTH, HEIGHT), K)
+
+
+class TestSeveralCameras:
+    @pytest.fixture
+    def camchain(self, tmp_path) -> Path:
+        file = kalibr_file(tmp_path / "camchain.yaml", "none", [])
+        second = kalibr_file(tmp_path / "other.yaml", "none", []).read_text()
+        file.write_text(file.read_text() + second.replace("cam0", "cam1").replace("110.0", "120.0"))
+        return file
+
+    @pytest.mark.parametrize(("camera", "focal_px"), [(None, 110), ("left", 110), ("right", 120)])
+    def test_the_one_that_is_meant(self, camchain, camera, focal_px) -> None:
+        lens = read_calibration(camchain, WIDTH, HEIGHT, camera=camera)
+        assert isinstance(lens, Lens)
+        assert lens.K[0, 0] == focal_px
+
+    def test_one_alone_is_the_one(self, tmp_path) -> None:
+        file = kalibr_file(tmp_path / "camchain.yaml", "none", [])
+        assert read_calibration(file, WIDTH, HEIGHT, camera="right").K[0, 0] == 110  # type: ignore[union-attr]
+
+    @pytest.mark.parametrize("camera", ["left", "right", None])
+    def test_of_a_source(self, tmp_path, camchain, caplog, camera) -> None:
+        wide = np.random.default_rng(0).integers(40, 255, (HEIGHT, WIDTH + 20, 3)).astype(np.uint8)
+        places = {"frames": 0} if camera is None else {"left": 6, "right": 0}
+        for name, column in places.items():
+            (tmp_path / "source" / name).mkdir(parents=True)
+            for number in range(4):
+                at = column + 2 * number
+                image = Image.fromarray(np.ascontiguousarray(wide[:, at : at + WIDTH]))
+                image.save(tmp_path / "source" / name / f"{number}.png")
+        config = IngestConfig(calibration=str(camchain), stereo_camera=camera or "left")
+        with caplog.at_level("INFO"):
+            found = read(tmp_path / "source" / ("frames" if camera is None else ""), config)
+        assert found.stereo_camera == camera
+        assert found.K[0, 0, 0] == pytest.approx(120 if camera == "right" else 110)
+        told = [record for record in caplog.records if " is taken" in record.message]
+        assert [record.levelname for record in told] == ["WARNING" if camera is None else "INFO"]
+        assert ("cam1 is taken" in told[0].message) == (camera == "right")
+        if camera is None:
+            assert "of cam0, cam1, cam0 is taken" in told[0].message
