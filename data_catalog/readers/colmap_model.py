@@ -35,7 +35,7 @@ from jaxtyping import Float, UInt8
 from data_catalog.calibration_files import LENS_OF_POSES
 from data_catalog.folder_reader import FolderReader
 from data_catalog.images import save_images
-from data_catalog.inside import inside
+from data_catalog.inside import inside, with_slashes
 from data_catalog.pose_conventions import PoseConvention
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from data_catalog.readers.beside_frames import tell_about_folders
@@ -121,7 +121,7 @@ def _image_root(folder: Path, names: list[str]) -> Path:
 def _lies_in(place: Path, name: str) -> bool:
     # An absolute name is the same file whatever folder it is looked for in.
     root = os.path.abspath(place)
-    file = os.path.normpath(os.path.join(root, name))
+    file = os.path.normpath(os.path.join(root, with_slashes(place, name, file=place)))
     return file.startswith(os.path.join(root, "")) and os.path.isfile(file)
 
 

@@ -44,7 +44,7 @@ from data_catalog.images import (
     read_depth,
     save_images,
 )
-from data_catalog.inside import inside
+from data_catalog.inside import inside, with_slashes
 from data_catalog.pose_conventions import OPENGL
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from data_catalog.readers.beside_frames import frames_among, listed_files, tell_about_folders
@@ -93,10 +93,19 @@ def _recognises(folder: Path) -> bool:
 
 
 def _load(file: Path) -> dict[str, Any]:
-    """What the file holds, without keys whose value is null."""
+    """What the file holds, without keys whose value is null, and with `/` in names of frames.
+
+    Raises:
+        SourceError: no list of frames, or a frame that is listed twice.
+    """
     content = load_frame_list(file, "file_path")
-    frames = [_stated(entry) for entry in content["frames"]]
-    return {**_stated(content), "frames": frames}
+    frames: dict[str, dict[str, Any]] = {}
+    for entry in content["frames"]:
+        name = with_slashes(file.parent, entry["file_path"], file=file)
+        if name in frames:
+            raise SourceError("the frame is listed twice", file=file, frame=name, field="file_path")
+        frames[name] = {**_stated(entry), "file_path": name}
+    return {**_stated(content), "frames": list(frames.values())}
 
 
 def _stated(entry: dict[str, Any]) -> dict[str, Any]:
@@ -331,19 +340,19 @@ def _pose(entry: dict[str, Any], scale: float, file: Path, frame: str) -> Float[
 
 def _splits(content: dict[str, Any], file: Path) -> dict[str, Literal["train", "test"]]:
     """Splits by `file_path`; empty where the file names none. Validation frames are held out too."""
+    known = {entry["file_path"] for entry in content["frames"]}
+    listed: dict[str, list[str]] = {}
     for key in ("train_filenames", "test_filenames", "val_filenames"):
         named = content.get(key) or []
         if not isinstance(named, list) or not all(isinstance(name, str) for name in named):
             raise SourceError("expected a list of file names", file=file, field=key)
-    held_out = [
-        name for key in ("test_filenames", "val_filenames") for name in content.get(key) or [] if name
-    ]
-    known = {entry["file_path"] for entry in content["frames"]}
-    training = content.get("train_filenames") or []
-    for listed in [*held_out, *sorted(training, key=natural_key)]:
-        if listed not in known:
+        listed[key] = [name if name in known else name.replace("\\", "/") for name in named]
+    held_out = [name for key in ("test_filenames", "val_filenames") for name in listed[key] if name]
+    training = listed["train_filenames"]
+    for name in [*held_out, *sorted(training, key=natural_key)]:
+        if name not in known:
             raise SourceError(
-                "the split names this frame, but `frames` does not", file=file, frame=listed, field="split"
+                "the split names this frame, but `frames` does not", file=file, frame=name, field="split"
             )
     return listed_split(known, training or None, held_out or None, file=file)
 

@@ -373,3 +373,14 @@ class TestPoints:
         file = tmp_path / "a.geometric.bin"
         file.write_bytes(b"3&2&1&" + np.arange(6, dtype="<f4").tobytes())
         np.testing.assert_array_equal(read_depth_map(file), np.arange(6, dtype=np.float32).reshape(2, 3))
+
+
+class TestModelsOfOtherPrograms:
+    def test_separators_of_windows(self, workspace) -> None:
+        expected = read(workspace)
+        rename_images(workspace, lambda name: name.replace("/", "\\"))
+        found = read(workspace)
+        assert found.frame_names == expected.frame_names
+        np.testing.assert_array_equal(found.mask, expected.mask)
+        np.testing.assert_array_equal(found.depth_mm, expected.depth_mm)
+        np.testing.assert_array_equal(found.recording, expected.recording)

@@ -176,3 +176,61 @@ class TestFocalLengths:
         with pytest.raises(SourceError, match="between 0 and 180 degrees") as caught:
             read(write(told))
         assert caught.value.field == next(iter(told))
+
+
+class TestSeparatorsOfWindows:
+    @pytest.fixture
+    def windows(self, write):
+        """Masks in a folder of their own; all names with the separators of Windows."""
+
+        def named(number: int) -> dict[str, str]:
+            return {
+                "file_path": f".\\images\\{number:03d}.png",
+                "mask_path": f"masks\\{number:03d}.png",
+                "depth_path": f"d\\{number}.png",
+            }
+
+        folder = write(
+            {**FOCAL, "integer_depth_scale": 1e-3, "test_filenames": [".\\images\\002.png"]}, named
+        )
+        white = np.full((HEIGHT, WIDTH), 255, np.uint8)
+        white[:, :5] = 0
+        for number in range(COUNT):
+            for place, picture in (("masks", white), ("d", np.full((HEIGHT, WIDTH), 20000, np.uint16))):
+                (folder / place).mkdir(exist_ok=True)
+                name = f"{number:03d}" if place == "masks" else f"{number}"
+                Image.fromarray(picture).save(folder / place / f"{name}.png")
+        return folder
+
+    def test_all_files_are_found(self, windows) -> None:
+        found = read(windows)
+        assert len(found) == COUNT
+        assert not found.mask[:, :, 0].any()
+        assert found.depth_mm is not None
+        assert found.test.tolist() == [2]
+        assert not any("\\" in name for name in found.frame_names)
+        names = {name for name, *_ in source_fingerprint(windows)["files"]}
+        assert {"images/001.png", "masks/001.png", "d/1.png"} <= names
+
+    def test_with_slashes_it_is_the_same(self, windows) -> None:
+        file = windows / "transforms.json"
+        first = read(windows)
+        file.write_text(file.read_text().replace("\\\\", "/"))
+        assert read(windows).frame_names == first.frame_names
+
+    def test_a_file_that_is_called_so_is_taken(self, write) -> None:
+        """On this system it is a letter like others."""
+        folder = write(FOCAL, lambda number: {"file_path": f"images\\{number}.png"})
+        for number in range(COUNT):
+            (folder / "images" / f"{number:03d}.png").rename(folder / f"images\\{number}.png")
+        assert len(read(folder)) == COUNT
+
+    def test_none_leads_out_of_the_folder(self, write) -> None:
+        folder = write(FOCAL, lambda number: {"file_path": f"..\\images\\{number:03d}.png"})
+        with pytest.raises(SourceError, match="leads out of the folder"):
+            read(folder)
+
+    def test_one_image_by_two_spellings(self, write) -> None:
+        spelled = ("images/000.png", "images\\000.png", "images/002.png", "images/003.png")
+        with pytest.raises(SourceError, match=r"frame images/000\.png.*listed twice"):
+            read(write(FOCAL, lambda number: {"file_path": spelled[number]}))
