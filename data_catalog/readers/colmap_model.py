@@ -17,8 +17,9 @@ COLMAP's poses are camera-from-world in OpenCV axes with pixel centres at +0.5; 
 reading and nothing else is turned or scaled. Every model of `extrags.lens` is understood; images of
 distorted cameras are resampled to a pinhole, those of pinhole cameras are taken as they are. Of several
 models (`sparse/0`, `sparse/1`, ...) the one with the most images is read. The sparse points become the
-starting points. Images that the model does not name have no pose and are left out, which the log says; so it
-does of frames without a mask where others have one. Frames without a mask are tissue throughout.
+starting points; those that are not finite are left out, with a warning. Images that the model does not name
+have no pose and are left out, which the log says; so it does of frames without a mask where others have one.
+Frames without a mask are tissue throughout.
 """
 
 from __future__ import annotations
@@ -47,6 +48,7 @@ from data_catalog.readers.colmap_files import (
     write_model,
 )
 from data_catalog.readers.frame_list import FilesBeside, listed_split, present_frames, warn_of_unmasked
+from data_catalog.readers.sparse_points import finite_points
 from extrags.cameras import pixel_rays
 from extrags.config import IngestConfig
 from extrags.errors import SourceError, SourceNotFoundError
@@ -226,15 +228,16 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
         )
         for image, item, parent in zip(images, used, folders, strict=True)
     ]
+    points, points_rgb = finite_points(model.points, model.points_rgb, pose_file.with_stem("points3D"))
     return SourceFrames(
         frames,
         pose_file=pose_file,
         metric=_is_metric(folder),
-        intrinsics_file=pose_file,
+        intrinsics_file=pose_file.with_stem("cameras"),
         lens_stays=LENS_OF_POSES,
         read_depth=lambda file, frame: read_depth_map(file, frame=frame),
-        points=model.points if len(model.points) else None,
-        points_rgb=model.points_rgb if len(model.points) else None,
+        points=points,
+        points_rgb=points_rgb,
     )
 
 

@@ -49,6 +49,7 @@ from data_catalog.pose_conventions import OPENGL
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from data_catalog.readers.beside_frames import frames_among, listed_files, tell_about_folders
 from data_catalog.readers.frame_list import listed_split, load_frame_list, matrix_of, present_frames
+from data_catalog.readers.sparse_points import read_ply_points, write_ply_points
 from data_catalog.readers.transforms_depth import (
     DEPTH_FILE_KEYS,
     DEPTH_KEYS,
@@ -58,7 +59,6 @@ from data_catalog.readers.transforms_depth import (
 )
 from data_catalog.readers.transforms_lens import DISTORTION_KEYS, FOCAL_KEYS, StatedLens, stated_values
 from data_catalog.readers.unknown_keys import warn_of_unknown_keys
-from extrags.array_files import load_ply_vertices
 from extrags.config import IngestConfig
 from extrags.errors import PoseError, SourceError, SourceNotFoundError
 from extrags.frame_names import NameOrder, natural_key, order_for_fingerprint, tell_about_order
@@ -273,7 +273,7 @@ def write_transforms(
             content[f"{name}_filenames"] = [frames[int(index)]["file_path"] for index in indices]
     if points is not None:
         content["ply_file_path"] = "points.ply"
-        _write_points(folder / "points.ply", points, points_rgb)
+        write_ply_points(folder / "points.ply", points, points_rgb)
     (folder / TRANSFORMS_FILE).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
@@ -365,40 +365,4 @@ def _points(
     place = inside(folder, str(content["ply_file_path"]), file=file, field="ply_file_path")
     if not place.is_file():
         raise SourceNotFoundError("no such file", file=place, field="ply_file_path")
-    try:
-        vertices = load_ply_vertices(place)
-        located = np.stack([np.asarray(vertices[axis], dtype=np.float64) for axis in "xyz"], axis=1)
-    except (OSError, TypeError, ValueError) as error:
-        raise SourceError(f"no PLY with vertices: {error}", file=place, field="ply_file_path") from error
-    finite = np.isfinite(located).all(axis=1)
-    if not finite.all():
-        logger.warning(
-            "%s: %d of %d points are not finite and left out", place, int((~finite).sum()), len(located)
-        )
-    if not finite.any():
-        return None, None
-    names = set(vertices.dtype.names or ())
-    if not {"red", "green", "blue"} <= names:
-        return located[finite], None
-    colored = [vertices[name] for name in ("red", "green", "blue")]
-    if any(values.dtype.kind not in "fiu" for values in colored):
-        raise SourceError("colours are not numbers", file=place, field="ply_file_path")
-    shades = np.nan_to_num(np.stack(colored, axis=1)[finite]).clip(0, 255).astype(np.uint8)
-    return located[finite], shades
-
-
-def _write_points(
-    file: Path, points: Float[np.ndarray, "p 3"], points_rgb: UInt8[np.ndarray, "p 3"] | None
-) -> None:
-    from plyfile import PlyData, PlyElement
-
-    kinds = [(axis, "f8") for axis in "xyz"]
-    if points_rgb is not None:
-        kinds += [(name, "u1") for name in ("red", "green", "blue")]
-    rows = np.zeros(len(points), dtype=kinds)
-    for index, axis in enumerate("xyz"):
-        rows[axis] = points[:, index]
-    if points_rgb is not None:
-        for index, color in enumerate(("red", "green", "blue")):
-            rows[color] = points_rgb[:, index]
-    PlyData([PlyElement.describe(rows, "vertex")]).write(str(file))
+    return read_ply_points(place, field="ply_file_path")

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from plyfile import PlyData, PlyElement
 
 from data_catalog.catalog import glance, read, source_fingerprint
 from data_catalog.readers.transforms_json import write_transforms
@@ -16,6 +17,7 @@ from extrags.errors import SourceError, SourceNotFoundError
 
 WIDTH, HEIGHT, COUNT = 32, 24, 4
 FOCAL = {"fl_x": 30.0, "fl_y": 30.0}
+COLORS = ("red", "green", "blue")
 
 
 @pytest.fixture
@@ -234,3 +236,26 @@ class TestSeparatorsOfWindows:
         spelled = ("images/000.png", "images\\000.png", "images/002.png", "images/003.png")
         with pytest.raises(SourceError, match=r"frame images/000\.png.*listed twice"):
             read(write(FOCAL, lambda number: {"file_path": spelled[number]}))
+
+
+class TestColoursOfPoints:
+    @pytest.mark.parametrize(
+        ("kind", "value", "expected"),
+        [
+            ("f4", 0.6, 153),
+            ("f8", 1.0, 255),
+            ("f4", 153.0, 153),
+            ("u2", 39321, 153),
+            ("u2", 153, 153),
+            ("u1", 1, 1),
+            ("i4", 153, 153),
+        ],
+    )
+    def test_by_their_kind(self, write, kind, value, expected) -> None:
+        rows = np.zeros(8, dtype=[*((axis, "f4") for axis in "xyz"), *((c, kind) for c in COLORS)])
+        rows["x"] = np.arange(8)
+        for color in COLORS:
+            rows[color][2:] = value
+        folder = write({**FOCAL, "ply_file_path": "points.ply"})
+        PlyData([PlyElement.describe(rows, "vertex")]).write(str(folder / "points.ply"))
+        np.testing.assert_array_equal(read(folder).points_rgb[:, 1], [0, 0] + 6 * [expected])
