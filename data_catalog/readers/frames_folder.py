@@ -63,6 +63,7 @@ from data_catalog.readers.stereo_frames import (
     stereo_folders,
     views_in_pictures,
 )
+from data_catalog.readers.transforms_files import tell_about_lists_above
 from data_catalog.sampling import Sampling
 from data_catalog.stereo import BothViews
 from extrags.config import IngestConfig
@@ -208,6 +209,7 @@ def _tell_what_is_passed_over(folder: Path, read: FramesOfCamera) -> None:
             )
     tell_about_pictures(folder, frames_among(_pictures(files[0].parent))[1])
     tell_what_is_not_read(folder)
+    tell_about_lists_above(folder)
     if footage := _footage(folder):
         logger.warning(
             "%s: %d images are read, and not %s; give its path to read that instead",

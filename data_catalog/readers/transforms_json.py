@@ -8,10 +8,12 @@ nothing else), `fl_x`, `fl_y` (pixels), `x_fov`, `y_fov` (degrees) or `camera_an
 (white is tissue), `depth_file_path` or `depth_path` (of frames without one, or whose file is absent, depth is
 unknown, with a warning);
 `train_filenames`, `test_filenames` and `val_filenames` (frames in none of them are left out); `ply_file_path`
-(points that are not finite are left out, with a warning). A `null` is as good as no value. Other keys are
-passed over; a warning names those that look misspelt or tell of distortion. Images of distorted cameras are
-resampled to a pinhole; a term of distortion that the camera's model has not is refused, unless it is 0; so
-are instant-ngp's other cameras (`ftheta_p0` to `ftheta_p4`, `latlong`, `equirectangular`).
+(points that are not finite are left out, with a warning). Where there is no such file but one for each split,
+as `transforms_train.json`, these are read (`data_catalog.readers.transforms_files`). A `null` is as good as
+no value. Other keys are passed over; a warning names those that look misspelt or tell of distortion. Images
+of distorted cameras are resampled to a pinhole; a term of distortion that the camera's model has not is
+refused, unless it is 0; so are instant-ngp's other cameras (`ftheta_p0` to `ftheta_p4`, `latlong`,
+`equirectangular`).
 
 Depth is z-depth; a value times `depth_unit_scale_factor` is in the unit of the poses. Where the file does not
 say, that is nerfstudio's 0.001 (or, for integers, instant-ngp's `integer_depth_scale`). Files that
@@ -44,11 +46,11 @@ from data_catalog.images import (
     read_depth,
     save_images,
 )
-from data_catalog.inside import inside, with_slashes
+from data_catalog.inside import inside
 from data_catalog.pose_conventions import OPENGL
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from data_catalog.readers.beside_frames import frames_among, listed_files, tell_about_folders
-from data_catalog.readers.frame_list import listed_split, load_frame_list, matrix_of, present_frames
+from data_catalog.readers.frame_list import listed_split, matrix_of, present_frames
 from data_catalog.readers.sparse_points import read_ply_points, write_ply_points
 from data_catalog.readers.transforms_depth import (
     DEPTH_FILE_KEYS,
@@ -56,6 +58,12 @@ from data_catalog.readers.transforms_depth import (
     NERFSTUDIO_DEPTH_SCALE,
     depth_factor,
     depth_files,
+)
+from data_catalog.readers.transforms_files import (
+    SPLIT_LISTS,
+    TRANSFORMS_FILE,
+    holds_transforms,
+    load_transforms,
 )
 from data_catalog.readers.transforms_lens import DISTORTION_KEYS, FOCAL_KEYS, StatedLens, stated_values
 from data_catalog.readers.unknown_keys import warn_of_unknown_keys
@@ -68,14 +76,13 @@ __all__ = ["READER", "TRANSFORMS_FILE", "write_transforms"]
 
 logger = logging.getLogger(__name__)
 
-TRANSFORMS_FILE = "transforms.json"
 _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _MM_PER_UNIT = {"mm": 1.0, "m": 1000.0, "arbitrary": 1.0}
 _FILE_KEYS = ("file_path", "mask_path", *DEPTH_FILE_KEYS)
 
 _KEYS = (
     *("frames", "transform_matrix", "length_unit", *DEPTH_KEYS),
-    *("train_filenames", "test_filenames", "val_filenames", "ply_file_path", *_FILE_KEYS),
+    *(*SPLIT_LISTS, "ply_file_path", *_FILE_KEYS),
     *("camera_model", "is_fisheye", "cx", "cy", "w", "h", *FOCAL_KEYS, *DISTORTION_KEYS),
 )
 """What is read, of all frames or of one."""
@@ -88,51 +95,28 @@ _OTHER_KEYS = (
 """What programs write, what changes nothing here, and is spelt like a key that does."""
 
 
-def _recognises(folder: Path) -> bool:
-    return (folder / TRANSFORMS_FILE).is_file()
-
-
-def _load(file: Path) -> dict[str, Any]:
-    """What the file holds, without keys whose value is null, and with `/` in names of frames.
-
-    Raises:
-        SourceError: no list of frames, or a frame that is listed twice.
-    """
-    content = load_frame_list(file, "file_path")
-    frames: dict[str, dict[str, Any]] = {}
-    for entry in content["frames"]:
-        name = with_slashes(file.parent, entry["file_path"], file=file)
-        if name in frames:
-            raise SourceError("the frame is listed twice", file=file, frame=name, field="file_path")
-        frames[name] = {**_stated(entry), "file_path": name}
-    return {**_stated(content), "frames": list(frames.values())}
-
-
-def _stated(entry: dict[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in entry.items() if value is not None}
-
-
 def _files(folder: Path) -> list[Path]:
-    file = folder / TRANSFORMS_FILE
-    content = _load(file)
-    found = {file}
-    for entry in content["frames"]:
+    listed = load_transforms(folder)
+    found = {file for file, _ in listed.parts}
+    for entry in listed.content["frames"]:
+        name = entry["file_path"]
         for key in _FILE_KEYS:
             if isinstance(entry.get(key), str):
-                place = inside(folder, entry[key], file=file, frame=entry["file_path"], field=key)
+                place = inside(folder, entry[key], file=listed.file_of[name], frame=name, field=key)
                 found.add(_with_suffix(place))
-    if isinstance(content.get("ply_file_path"), str):
-        found.add(inside(folder, content["ply_file_path"], file=file, field="ply_file_path"))
+    if isinstance(listed.content.get("ply_file_path"), str):
+        name = listed.content["ply_file_path"]
+        found.add(inside(folder, name, file=listed.file, field="ply_file_path"))
     return sorted(file for file in found if file.is_file())
 
 
 def _chosen(folder: Path) -> dict[str, Any]:
-    return order_for_fingerprint(entry["file_path"] for entry in _load(folder / TRANSFORMS_FILE)["frames"])
+    return order_for_fingerprint(load_transforms(folder).file_of)
 
 
 def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
-    file = folder / TRANSFORMS_FILE
-    content = _load(file)
+    transforms = load_transforms(folder)
+    content, file, file_of = transforms.content, transforms.file, transforms.file_of
     unit = content.get("length_unit", "arbitrary")
     if not isinstance(unit, str) or unit not in _MM_PER_UNIT:
         raise SourceError(
@@ -140,20 +124,21 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
             file=file,
             field="length_unit",
         )
-    warn_of_unknown_keys(
-        content, known=_KEYS, known_of_frames=_KEYS, frame_name="file_path", file=file, others=_OTHER_KEYS
-    )
+    for part, held in transforms.parts:
+        warn_of_unknown_keys(
+            held, known=_KEYS, known_of_frames=_KEYS, frame_name="file_path", file=part, others=_OTHER_KEYS
+        )
     scale = _MM_PER_UNIT[unit]
-    order = NameOrder(entry["file_path"] for entry in content["frames"])
+    order = NameOrder(file_of)
     listed = sorted(content["frames"], key=lambda entry: order.key(entry["file_path"]))
     tell_about_order(file, order)
     files = {}
     for entry in listed:
         name = entry["file_path"]
-        files[name] = _with_suffix(inside(folder, name, file=file, frame=name, field="file_path"))
+        files[name] = _with_suffix(inside(folder, name, file=file_of[name], frame=name, field="file_path"))
     _check_apart(files, "file_path", "the image is listed twice, as {}", file)
     present = present_frames(files, config.max_absent_share, listing=file)
-    splits = _splits(content, file)
+    splits = transforms.splits or _splits(content, file)
     used = present & splits.keys() if splits else present
     entries = [entry for entry in listed if entry["file_path"] in used]
     folders = sorted({str(Path(entry["file_path"]).parent) for entry in entries}, key=natural_key)
@@ -161,14 +146,14 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     frames = []
     for entry in entries:
         frame = entry["file_path"]
-        place = files[frame]
+        place, listing = files[frame], file_of[frame]
         frames.append(
             PosedFrame(
                 name=str(Path(frame).relative_to("images")) if frame.startswith("images/") else frame,
                 file=place,
-                lens=StatedLens(stated_values(content, entry), file, frame).lens(place),
-                world_from_camera=_pose(entry, scale, file, frame),
-                mask_file=_mask_file(folder, entry, frame),
+                lens=StatedLens(stated_values(content, entry), listing, frame).lens(place),
+                world_from_camera=_pose(entry, scale, listing, frame),
+                mask_file=_mask_file(listing, entry, frame),
                 depth_file=depth_file_of[frame],
                 recording=folders.index(str(Path(frame).parent)),
                 split=splits.get(frame),
@@ -202,9 +187,9 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
 READER = FolderReader(
     name="transforms",
     version=7,
-    summary=f"{TRANSFORMS_FILE} of nerfstudio or instant-ngp, described in "
-    "data_catalog/readers/transforms_json.py",
-    recognises=_recognises,
+    summary=f"{TRANSFORMS_FILE} of nerfstudio or instant-ngp, or transforms_train.json and its like, "
+    "described in data_catalog/readers/transforms_json.py",
+    recognises=holds_transforms,
     files=_files,
     frames=_frames,
     conventions="OpenGL camera axes (y up, z backward, turned on reading), camera to world; "
@@ -314,16 +299,11 @@ def _tell_about_unlisted(file: Path, frames: list[PosedFrame], listed: Collectio
         )
 
 
-def _beside(folder: Path, entry: dict[str, Any], key: str) -> Path | None:
-    """The file that a frame names, which may be absent; None where it names none."""
-    if key not in entry:
+def _mask_file(listing: Path, entry: dict[str, Any], frame: str) -> Path | None:
+    if "mask_path" not in entry:
         return None
-    return inside(folder, str(entry[key]), file=folder / TRANSFORMS_FILE, frame=entry["file_path"], field=key)
-
-
-def _mask_file(folder: Path, entry: dict[str, Any], frame: str) -> Path | None:
-    file = _beside(folder, entry, "mask_path")
-    if file is not None and not file.is_file():
+    file = inside(listing.parent, str(entry["mask_path"]), file=listing, frame=frame, field="mask_path")
+    if not file.is_file():
         raise SourceNotFoundError("no such file", file=file, frame=frame, field="mask_path")
     return file
 
@@ -342,7 +322,7 @@ def _splits(content: dict[str, Any], file: Path) -> dict[str, Literal["train", "
     """Splits by `file_path`; empty where the file names none. Validation frames are held out too."""
     known = {entry["file_path"] for entry in content["frames"]}
     listed: dict[str, list[str]] = {}
-    for key in ("train_filenames", "test_filenames", "val_filenames"):
+    for key in SPLIT_LISTS:
         named = content.get(key) or []
         if not isinstance(named, list) or not all(isinstance(name, str) for name in named):
             raise SourceError("expected a list of file names", file=file, field=key)

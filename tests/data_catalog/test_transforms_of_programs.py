@@ -259,3 +259,96 @@ class TestColoursOfPoints:
         folder = write({**FOCAL, "ply_file_path": "points.ply"})
         PlyData([PlyElement.describe(rows, "vertex")]).write(str(folder / "points.ply"))
         np.testing.assert_array_equal(read(folder).points_rgb[:, 1], [0, 0] + 6 * [expected])
+
+
+class TestFilesOfSplits:
+    """As in the synthetic scenes of NeRF: a file and a folder for each split, images named without suffix."""
+
+    @pytest.fixture
+    def scene(self, tmp_path):
+        def written(splits=("train", "val", "test"), **of_one) -> Path:
+            texture = np.random.default_rng(0).integers(40, 255, (HEIGHT, WIDTH + 40, 3)).astype(np.uint8)
+            for at, split in enumerate(splits):
+                (tmp_path / split).mkdir()
+                frames = []
+                for number in range(COUNT):
+                    shift = 10 * at + number
+                    image = Image.fromarray(texture[:, shift : shift + WIDTH])
+                    image.save(tmp_path / split / f"r_{number}.png")
+                    pose = np.diag([1.0, -1, -1, 1])
+                    pose[0, 3] = shift
+                    name = f"./{split}/r_{number}"
+                    frames.append({"file_path": name, "rotation": 0.03, "transform_matrix": pose.tolist()})
+                content = {"camera_angle_x": np.pi / 3, "frames": frames, **of_one.get(split, {})}
+                (tmp_path / f"transforms_{split}.json").write_text(json.dumps(content))
+            return tmp_path
+
+        return written
+
+    def test_one_trains_and_one_evaluates(self, scene, caplog) -> None:
+        folder = scene()
+        found = read(folder)
+        assert not caplog.messages
+        assert sorted(np.array(found.frame_names)[found.train]) == [
+            f"./train/r_{k}"[2:] for k in range(COUNT)
+        ]
+        assert sorted(np.array(found.frame_names)[found.test]) == [f"test/r_{k}" for k in range(COUNT)]
+        centers = {
+            name: center[0] for name, center in zip(found.frame_names, found.cameras.centers, strict=True)
+        }
+        assert centers["train/r_2"] == 2
+        assert centers["test/r_1"] == 21
+        np.testing.assert_allclose(found.K[:, 0, 0], 27.712813, rtol=1e-6)
+
+    def test_files_that_count(self, scene) -> None:
+        folder = scene()
+        names = {name for name, *_ in source_fingerprint(folder)["files"]}
+        assert {"transforms_train.json", "transforms_test.json", "train/r_0.png", "test/r_3.png"} <= names
+        assert not any("val" in name for name in names)
+        assert glance(folder).test == COUNT
+
+    def test_without_a_test_the_validation_evaluates(self, scene) -> None:
+        found = read(scene(("train", "val")))
+        assert {found.frame_names[k].split("/")[0] for k in found.test} == {"val"}
+
+    def test_training_frames_alone_are_split_by_the_usual_rule(self, scene) -> None:
+        found = read(scene(("train",)), IngestConfig(holdout_every=2))
+        assert len(found) == COUNT
+        assert len(found.test) == COUNT // 2
+
+    def test_each_file_has_its_own_camera(self, scene) -> None:
+        found = read(scene(test={"camera_angle_x": 1.2}))
+        focal = dict(zip(found.frame_names, found.K[:, 0, 0], strict=True))
+        assert focal["train/r_0"] == pytest.approx(27.712813)
+        assert focal["test/r_0"] == pytest.approx(16 / np.tan(0.6))
+
+    def test_errors_name_the_file(self, scene) -> None:
+        folder = scene()
+        file = folder / "transforms_test.json"
+        content = json.loads(file.read_text())
+        del content["frames"][2]["transform_matrix"]
+        file.write_text(json.dumps(content))
+        with pytest.raises(SourceError, match=r"transforms_test\.json, frame \./test/r_2, field transform_m"):
+            read(folder)
+
+    def test_files_that_contradict_each_other(self, scene) -> None:
+        folder = scene(test={"length_unit": "mm"})
+        with pytest.raises(SourceError, match=r"transforms_test\.json, field length_unit: 'mm', but None in"):
+            read(folder)
+
+    def test_a_frame_of_two_splits(self, scene) -> None:
+        folder = scene()
+        (folder / "transforms_test.json").write_text((folder / "transforms_train.json").read_text())
+        with pytest.raises(SourceError, match=r"transforms_train\.json lists this frame, too"):
+            read(folder)
+
+    def test_a_single_file_counts_first(self, scene, write) -> None:
+        scene()
+        assert len(read(write())) == COUNT
+
+    def test_a_part_of_it_is_read_without_poses(self, scene, caplog) -> None:
+        folder = scene()
+        found = read(folder / "train")
+        assert found.world_from_camera is None
+        expected = f"train is read without poses; {folder / 'transforms_train.json'} lists frames"
+        assert any(expected in line for line in caplog.messages)
