@@ -61,7 +61,8 @@ _KINDS: dict[str, LensKind] = {
 }
 _WORDS_OF_LENSES = re.compile(
     r"fish|omni|catadioptric|radial|division|sphere|spherical|equidist|equirect|equisolid|stereographic|"
-    r"scaramuzza|ocam|kannala|unified|mirror|orthograph|pinhole|distort|opencv|prism|^(fov|atan|mei|ucm|eucm|ds|kb\d*)$"
+    r"scaramuzza|ocam|kannala|unified|mirror|orthograph|pinhole|distort|opencv|prism|"
+    r"^(fov|atan|mei|ucm|eucm|ds|kb\d*)$"
 )
 _EXAMPLES = "pinhole, plumb_bob, rational_polynomial, opencv, fisheye or equidistant"
 _YES, _NO = ("1", "true", "yes", "on"), ("0", "false", "no", "off")
@@ -187,8 +188,9 @@ def _kind_in_mapping(name: str, entries: Mapping[str, Any], file: Path) -> LensK
     """The kind of lens that any entry of a mapping names.
 
     Raises:
-        SourceError: a lens that is not known here, or distortion, which is not looked for there.
+        SourceError: a lens that is not known here, or distortion or a mirror, which are not looked for there.
     """
+    check_without_mirror({str(entry): value for entry, value in entries.items()}, file=file)
     for entry, value in entries.items():
         if tells_distortion(str(entry), value):
             problem = f"{entry!r} is distortion; expected it beside this entry"

@@ -494,6 +494,7 @@ class TestOtherModels:
             {"xi": 1.2},
             {"xi": {"rows": 1, "cols": 1, "data": [1.2]}},
             {"mirror_parameters": {"xi": 1.2}},
+            {"xi": 1.2, "camera_model": {"type": "pinhole"}},
         ],
         ids=str,
     )
@@ -504,6 +505,12 @@ class TestOtherModels:
             read_calibration(tmp_path / "a.json", WIDTH, HEIGHT)
         assert caught.value.field == next(iter(told))
         assert caught.value.file == str(tmp_path / "a.json")
+
+    def test_within_the_entry_of_the_model(self, tmp_path) -> None:
+        content = {"camera_matrix": K.tolist(), "camera_model": {"type": "pinhole", "xi": 1.2}}
+        (tmp_path / "a.json").write_text(json.dumps(content))
+        with pytest.raises(SourceError, match=r"field xi: .*unified omnidirectional model"):
+            read_calibration(tmp_path / "a.json", WIDTH, HEIGHT)
 
     def test_in_opencvs_own_files(self, tmp_path) -> None:
         file = opencv_file(tmp_path / "a.xml", [-0.05, 0.02, 0, 0])
