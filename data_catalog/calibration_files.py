@@ -1,11 +1,13 @@
 """Calibration files of endoscopes (OpenCV, Kalibr, Scaramuzza), which take the place of a source's own lens.
 
 * OpenCV: YAML, XML or JSON of `cv::FileStorage` with `camera_matrix` and `distortion_coefficients` (0, 4, 5,
-  8 or more numbers; with 4 and `fisheye_model: 1`, or a `distortion_model` or `camera_model` that says so,
-  the Kannala-Brandt fisheye), and `image_width` and `image_height`, or `image_size` with both, without which
-  the calibration holds for the images as they are. Numbers are a matrix of OpenCV's, a plain list, or what
-  ROS writes (`rows`, `cols`, `data`).
-* Kalibr: the `camchain.yaml` with the camera `cam0`: pinhole with radtan, equidistant, fov or no distortion.
+  8 or more numbers; with 4 and `fisheye_model: 1`, or a `distortion_model`, `camera_model`,
+  `calibration_model`, `lens_model` or `projection_model` that says so, the Kannala-Brandt fisheye), and
+  `image_width` and `image_height`, or `image_size` with both, without which the calibration holds for the
+  images as they are. Numbers are a matrix of OpenCV's, a plain list, or what ROS writes (`rows`, `cols`,
+  `data`). A mirror's parameter `xi` is refused, unless it is 0.
+* Kalibr: the `camchain.yaml` with the camera `cam0`, of a stereo endoscope's right camera `cam1` where there
+  is one: pinhole with radtan, equidistant, fov or no distortion.
 * Scaramuzza: `calib_results.txt` of OCamCalib, a polynomial of fourth degree.
 
 In all three the centre of the first pixel is (0, 0); here it is (0.5, 0.5).
@@ -28,12 +30,13 @@ import numpy as np
 from data_catalog.c3vd.pinhole import PinholeResampling, own_pixels
 from data_catalog.c3vd.scaramuzza import ScaramuzzaCamera, camera_from_json
 from data_catalog.file_storage import read_file_storage
-from data_catalog.lens_entries import lens_kind, tells_distortion
+from data_catalog.lens_entries import SIZE_NAMES, check_without_mirror, lens_kind, tells_distortion
 from data_catalog.posed_frames import SourceFrames
 from data_catalog.sampling import CameraModel, LensSampling, Sampling
 from extrags.config import IngestConfig
 from extrags.errors import ConfigError, SourceError, SourceNotFoundError
 from extrags.lens import Lens
+from extrags.provenance import StereoCamera
 
 __all__ = ["CALIBRATION_VERSION", "LENS_OF_POSES", "read_calibration", "with_calibration_file"]
 
@@ -46,7 +49,7 @@ LENS_OF_POSES = (
 )
 """Why the lens of a source stays whose poses are of structure from motion."""
 
-CALIBRATION_VERSION = 4
+CALIBRATION_VERSION = 5
 """Raised by hand whenever the same file gives another camera."""
 
 _PROPORTION_TOLERANCE = 0.005
@@ -58,13 +61,12 @@ _OPENCV_NAMES = {
         *("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "dist_coeffs", "dist_coeff"),
         *("distortion_coeffs", "distortion", "dist", "D"),
     ),
-    "width": ("image_width", "image_Width", "imageWidth"),
-    "height": ("image_height", "image_Height", "imageHeight"),
-    "size": ("image_size", "imageSize", "image_Size", "img_size"),
+    **SIZE_NAMES,
 }
 _MODEL = "distortion_model"
 _OPENCV_COUNTS = (0, 4, 5, 8, 12, 14)
 _KALIBR_CAMERA = re.compile(r"""^[\s{"']*cam0["']?\s*:""", re.MULTILINE)
+_KALIBR_NAME = re.compile(r"cam(\d{1,3})")
 _KALIBR_MODELS = {
     "none": ("PINHOLE", 0),
     "radtan": ("OPENCV", 4),
@@ -73,13 +75,17 @@ _KALIBR_MODELS = {
 }
 
 
-def read_calibration(file: Path, width: int, height: int) -> Lens | ScaramuzzaCamera:
+def read_calibration(
+    file: Path, width: int, height: int, *, camera: StereoCamera | None = None
+) -> Lens | ScaramuzzaCamera:
     """The camera that a calibration file describes, for images of a size.
 
     Args:
         file: told apart by its content.
         width: of the images, in pixels.
         height: of the images, in pixels.
+        camera: of a stereo endoscope, whose images they are: of a file of Kalibr's with several cameras the
+            second is that of the right one. None takes the first.
 
     Returns:
         A lens of COLMAP's names (pixel centres at +0.5), or Scaramuzza's camera (centres at integers).
@@ -88,17 +94,11 @@ def read_calibration(file: Path, width: int, height: int) -> Lens | ScaramuzzaCa
         SourceNotFoundError: no such file.
         SourceError: damaged, of an unknown kind, or for images of another proportion; names file and field.
     """
-    if not file.is_file():
-        raise SourceNotFoundError("no such calibration file", file=file, field="ingest.calibration")
-    try:
-        # Editors on Windows put a mark at the beginning.
-        text = file.read_text(encoding="utf-8-sig")
-    except (UnicodeDecodeError, OSError) as error:
-        raise SourceError(f"cannot be read as text: {error}", file=file, field="calibration") from error
+    text = _text(file)
     if "#polynomial coefficients" in text:
         return _ocamcalib(text, file).scaled(width, height, file=file)
-    if "distortion_model" in text and _KALIBR_CAMERA.search(text) is not None:
-        return _scaled(_kalibr(text, file), width, height, file)
+    if _is_kalibr(text):
+        return _scaled(_kalibr(text, file, camera), width, height, file)
     if any(name in text for name in _OPENCV_NAMES["K"][:3]):
         return _scaled(_opencv(text, width, height, file), width, height, file)
     raise SourceError(
@@ -107,6 +107,17 @@ def read_calibration(file: Path, width: int, height: int) -> Lens | ScaramuzzaCa
         file=file,
         field="calibration",
     )
+
+
+def _text(file: Path) -> str:
+    if not file.is_file():
+        raise SourceNotFoundError("no such calibration file", file=file, field="ingest.calibration")
+    try:
+        # Editors on Windows put a mark at the beginning.
+        text = file.read_text(encoding="utf-8-sig")
+    except (UnicodeDecodeError, OSError) as error:
+        raise SourceError(f"cannot be read as text: {error}", file=file, field="calibration") from error
+    return text
 
 
 def with_calibration_file(source: SourceFrames, file: Path) -> SourceFrames:
@@ -124,9 +135,10 @@ def with_calibration_file(source: SourceFrames, file: Path) -> SourceFrames:
             f"intrinsics itself. {source.lens_stays}"
         )
     lenses = {
-        lens: read_calibration(file, lens.width, lens.height)
+        lens: read_calibration(file, lens.width, lens.height, camera=source.stereo_camera)
         for lens in dict.fromkeys(frame.lens for frame in source.frames)
     }
+    _tell_of_cameras(file, source.stereo_camera)
     if source.intrinsics != "guessed":
         stated, calibrated = next(iter(lenses.items()))
         logger.warning(
@@ -214,6 +226,7 @@ def _opencv(text: str, width: int, height: int, file: Path) -> _Described:
     storage = read_file_storage(text, file, (*_OPENCV_NAMES["K"], *_OPENCV_NAMES["D"]))
     K, D = (_matrix(storage, name, file) for name in ("K", "D"))
     width, height = _size(storage, file) or (width, height)
+    check_without_mirror(storage, file=file)
     fisheye = _is_fisheye(storage, file)
     if K is None or K.size != 9:
         raise SourceError("expected a matrix of 3 x 3 numbers", file=file, field="camera_matrix")
@@ -318,16 +331,57 @@ def _matrix(storage: Mapping[str, Any], key: str, file: Path) -> np.ndarray | No
         raise SourceError(f"expected numbers: {error}", file=file, field=name) from error
 
 
-def _kalibr(text: str, file: Path) -> _Described:
+def _is_kalibr(text: str) -> bool:
+    return "distortion_model" in text and _KALIBR_CAMERA.search(text) is not None
+
+
+def _kalibr_cameras(text: str, file: Path) -> dict[str, Any]:
+    """Entries of the cameras of Kalibr's file, in their order.
+
+    Raises:
+        SourceError: no YAML.
+    """
     import yaml
 
     try:
         content = yaml.safe_load(text)
     except yaml.YAMLError as error:
         raise SourceError(f"no YAML: {error}", file=file, field="calibration") from error
-    camera = content.get("cam0") if isinstance(content, Mapping) else None
+    named = content.keys() if isinstance(content, Mapping) else ()
+    numbers = {int(found[1]): name for name in named if (found := _KALIBR_NAME.fullmatch(str(name)))}
+    return {str(numbers[number]): content[numbers[number]] for number in sorted(numbers)}
+
+
+def _kalibr_name(cameras: Mapping[str, Any], camera: StereoCamera | None) -> str:
+    """Which of Kalibr's cameras is meant; of one alone, that one."""
+    return "cam1" if camera == "right" and "cam1" in cameras else "cam0"
+
+
+def _tell_of_cameras(file: Path, camera: StereoCamera | None) -> None:
+    """Say which camera of a file with several was taken."""
+    text = _text(file)
+    cameras = _kalibr_cameras(text, file) if _is_kalibr(text) else {}
+    if len(cameras) < 2:
+        return
+    taken = _kalibr_name(cameras, camera)
+    if camera is not None:
+        logger.info("%s: %s is taken, as that of the %s camera", file, taken, camera)
+        return
+    logger.warning(
+        "%s: of %s, %s is taken; to take another, give it as cam0 of a file of its own",
+        file,
+        ", ".join(cameras),
+        taken,
+        extra={"topic": "calibration", "field": taken},
+    )
+
+
+def _kalibr(text: str, file: Path, which: StereoCamera | None) -> _Described:
+    cameras = _kalibr_cameras(text, file)
+    name = _kalibr_name(cameras, which)
+    camera = cameras.get(name)
     if not isinstance(camera, Mapping):
-        raise SourceError("expected the entries of a camera", file=file, field="cam0")
+        raise SourceError("expected the entries of a camera", file=file, field=name)
     if camera.get("camera_model") != "pinhole":
         raise SourceError(
             f"found {camera.get('camera_model')!r}; expected pinhole", file=file, field="camera_model"

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from extrags.errors import SourceError
 
-__all__ = ["inside"]
+__all__ = ["inside", "with_slashes"]
 
 
 def inside(
@@ -15,8 +15,9 @@ def inside(
 ) -> Path:
     """The file that a name in a source means.
 
-    Absolute names are taken where they lead into the folder, and `..` where it stays in it. Links are
-    followed: they are made on this machine, and what they lead to counts in cache keys by its content.
+    Absolute names are taken where they lead into the folder, and `..` where it stays in it. A name with the
+    separators of Windows is taken with `/`, where there is no file of that name. Links are followed: they are
+    made on this machine, and what they lead to counts in cache keys by its content.
 
     Args:
         folder: of the source.
@@ -28,6 +29,29 @@ def inside(
     Raises:
         SourceError: it leads out of the folder, or is no file name.
     """
+    spelled = with_slashes(folder, name, file=file)
+    return _below(folder, spelled, file=file, frame=frame, field=field)
+
+
+def with_slashes(folder: Path, name: str, *, file: Path) -> str:
+    """A name in a source as `inside` takes it: with `/` where it has the separators of Windows.
+
+    Args:
+        folder: of the source.
+        name: as written in `file`; whether it leads out of the folder is not looked at.
+        file: that holds it.
+    """
+    if "\\" not in name:
+        return name
+    try:
+        found = _below(folder, name, file=file, frame=None, field=None)
+    except SourceError:
+        # Only as a name of this system's it leads elsewhere, or is too long.
+        return name.replace("\\", "/")
+    return name if os.path.lexists(found) else name.replace("\\", "/")
+
+
+def _below(folder: Path, name: str, *, file: Path, frame: str | int | None, field: str | None) -> Path:
     if not _is_text(name) or len(os.fsencode(name)) > _LONGEST:
         raise SourceError(f"{name[:80]!r} is no file name", file=file, frame=_shown(frame), field=field)
     root = os.path.abspath(folder)

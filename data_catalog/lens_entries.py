@@ -16,15 +16,35 @@ import numpy as np
 
 from extrags.errors import SourceError
 
-__all__ = ["LensKind", "check_pinhole", "is_about_lens", "lens_kind", "tells_distortion"]
+__all__ = [
+    "SIZE_NAMES",
+    "LensKind",
+    "check_pinhole",
+    "check_without_mirror",
+    "is_about_lens",
+    "lens_kind",
+    "tells_distortion",
+    "tells_mirror",
+]
 
 LensKind = Literal["pinhole", "polynomial", "fisheye"]
 """`pinhole`: undistorted, or nothing is said of distortion; `polynomial`: OpenCV's radial and tangential
 terms, a pinhole where all are zero; `fisheye`: Kannala and Brandt's, no pinhole whatever its terms."""
 
+SIZE_NAMES = {
+    "width": ("image_width", "image_Width", "imageWidth"),
+    "height": ("image_height", "image_Height", "imageHeight"),
+    "size": ("image_size", "imageSize", "image_Size", "img_size"),
+}
+"""What programs call width and height of the images that were calibrated with, and both in one entry."""
+
 _DISTORTION = re.compile(r"(?<!un)distort|dist_?coef|^(lens_?)?dist$", re.IGNORECASE)
 _TERM = re.compile(r"[kp][1-6]")
-_MODEL_NAMES = ("distortion_model", "camera_model", "model")
+_NAMES_OF_PRODUCTS_TOO = ("camera_model", "lens_model", "model")
+"""Names of entries that may hold what an endoscope's maker calls it."""
+_MODEL_NAMES = ("distortion_model", "calibration_model", "projection_model", *_NAMES_OF_PRODUCTS_TOO)
+_MIRROR_NAMES = ("xi", "mirror_parameters")
+"""The parameter of Mei's model as OpenCV's omnidir writes it, and the mapping in which camodocal does."""
 _SWITCHES = ("fisheye_model", "fisheye", "is_fisheye")
 _KINDS: dict[str, LensKind] = {
     **dict.fromkeys(("", "none", "no", "pinhole", "simple_pinhole", "perspective", "undistorted"), "pinhole"),
@@ -41,7 +61,8 @@ _KINDS: dict[str, LensKind] = {
 }
 _WORDS_OF_LENSES = re.compile(
     r"fish|omni|catadioptric|radial|division|sphere|spherical|equidist|equirect|equisolid|stereographic|"
-    r"scaramuzza|ocam|kannala|unified|pinhole|distort|opencv|prism|^(fov|atan|mei|ucm|eucm|ds|kb\d*)$"
+    r"scaramuzza|ocam|kannala|unified|mirror|orthograph|pinhole|distort|opencv|prism|"
+    r"^(fov|atan|mei|ucm|eucm|ds|kb\d*)$"
 )
 _EXAMPLES = "pinhole, plumb_bob, rational_polynomial, opencv, fisheye or equidistant"
 _YES, _NO = ("1", "true", "yes", "on"), ("0", "false", "no", "off")
@@ -61,7 +82,7 @@ def _is_named_distortion(name: str) -> bool:
 
 def is_about_lens(name: str) -> bool:
     """Whether an entry is one that `check_pinhole` looks at, by its name."""
-    return _is_named_distortion(name) or name in (*_MODEL_NAMES, *_SWITCHES)
+    return _is_named_distortion(name) or name in (*_MODEL_NAMES, *_SWITCHES, *_MIRROR_NAMES)
 
 
 def tells_distortion(name: str, value: Any) -> bool:
@@ -69,11 +90,39 @@ def tells_distortion(name: str, value: Any) -> bool:
     return _is_named_distortion(name) and _is_more_than_nothing(value)
 
 
+def tells_mirror(name: str, value: Any) -> bool:
+    """Whether an entry is a parameter of the unified omnidirectional model that is not zero.
+
+    With a parameter of zero this model is a pinhole with OpenCV's terms of distortion.
+    """
+    return name in _MIRROR_NAMES and _is_more_than_nothing(value)
+
+
+def check_without_mirror(entries: Mapping[str, Any], *, file: Path, frame: object = None) -> None:
+    """Refuse entries of the unified omnidirectional model, with which pixels lie elsewhere.
+
+    Args:
+        entries: by name.
+        file: that holds them.
+        frame: whose they are; None for all frames.
+
+    Raises:
+        SourceError: names the entry.
+    """
+    for name, value in entries.items():
+        if tells_mirror(name, value):
+            problem = (
+                f"{_shown(value)}; this is the unified omnidirectional model (Mei; cv::omnidir), not known "
+                "here; expected a calibration as a pinhole with distortion, a fisheye or OCamCalib's"
+            )
+            raise SourceError(problem, file=file, frame=frame, field=name)
+
+
 def lens_kind(name: str, value: Any, file: Path) -> LensKind | None:
     """The kind of lens that an entry names; None where it is about something else.
 
-    `camera_model` and `model` may be what an endoscope's maker calls it, and count only where they name a
-    lens. A mapping is looked through, and a lens of more terms counts before one of fewer.
+    `camera_model`, `lens_model` and `model` may be what an endoscope's maker calls it, and count only where
+    they name a lens. A mapping is looked through, and a lens of more terms counts before one of fewer.
 
     Raises:
         SourceError: a lens that is not known here, or no answer to whether it is a fisheye.
@@ -85,13 +134,21 @@ def lens_kind(name: str, value: Any, file: Path) -> LensKind | None:
         return None if answer is None else "fisheye" if answer else "polynomial"
     if name not in _MODEL_NAMES:
         return None
-    free_text = name != "distortion_model"
-    if free_text and isinstance(value, Mapping):
+    if name != "distortion_model" and isinstance(value, Mapping):
         return _kind_in_mapping(name, value, file)
+    return _named_kind(name, value, file, may_be_product=name in _NAMES_OF_PRODUCTS_TOO)
+
+
+def _named_kind(name: str, value: Any, file: Path, *, may_be_product: bool) -> LensKind | None:
+    """The kind of lens that a text names; None for a text of which nothing is asked and that names none.
+
+    Raises:
+        SourceError: a lens that is not known here.
+    """
     spelled = re.sub(r"[\s+/-]+", "_", str(value).strip().lower())
     # Projection and distortion in one, as Kalibr calls its models: pinhole-radtan.
     found = _KINDS.get(spelled, _KINDS.get(spelled.removeprefix("pinhole_")))
-    if found is None and (not free_text or _WORDS_OF_LENSES.search(spelled) is not None):
+    if found is None and (not may_be_product or _WORDS_OF_LENSES.search(spelled) is not None):
         problem = f"found {value!r}; expected a lens model that is known here, such as {_EXAMPLES}"
         raise SourceError(problem, file=file, field=name)
     return found
@@ -109,11 +166,10 @@ def check_pinhole(entries: Mapping[str, Any], instead: str, *, file: Path, frame
     Raises:
         SourceError: names the entry.
     """
+    check_without_mirror(entries, file=file, frame=frame)
     for name, value in entries.items():
         if tells_distortion(name, value) or _names_other_lens(name, value, file):
-            shown = json.dumps(value)
-            shown = shown if len(shown) <= _LONGEST_SHOWN else f"{shown[:_LONGEST_SHOWN]} ..."
-            problem = f"{shown}; expected a pinhole here. {instead}"
+            problem = f"{_shown(value)}; expected a pinhole here. {instead}"
             raise SourceError(problem, file=file, frame=frame, field=name)
 
 
@@ -124,20 +180,27 @@ def _names_other_lens(name: str, value: Any, file: Path) -> bool:
     except SourceError:
         return True
     # A model of distortion is a pinhole's where its terms are zero, and these are looked at by themselves.
-    return kind == "fisheye" or (kind == "polynomial" and name in ("camera_model", "model"))
+    is_projection = name in _MODEL_NAMES and name != "distortion_model"
+    return kind == "fisheye" or (kind == "polynomial" and is_projection)
 
 
 def _kind_in_mapping(name: str, entries: Mapping[str, Any], file: Path) -> LensKind | None:
     """The kind of lens that any entry of a mapping names.
 
     Raises:
-        SourceError: a lens that is not known here, or distortion, which is not looked for there.
+        SourceError: a lens that is not known here, or distortion or a mirror, which are not looked for there.
     """
+    check_without_mirror({str(entry): value for entry, value in entries.items()}, file=file)
     for entry, value in entries.items():
         if tells_distortion(str(entry), value):
             problem = f"{entry!r} is distortion; expected it beside this entry"
             raise SourceError(problem, file=file, field=name)
-    kinds = {lens_kind(name, value, file) for value in entries.values()}
+    kinds: set[LensKind | None] = set()
+    for value in entries.values():
+        if isinstance(value, Mapping):
+            kinds.add(_kind_in_mapping(name, value, file))
+        elif value is not None:
+            kinds.add(_named_kind(name, value, file, may_be_product=True))
     return next((kind for kind in get_args(LensKind)[::-1] if kind in kinds), None)
 
 
@@ -157,6 +220,12 @@ def _answer(name: str, value: Any, file: Path) -> bool | None:
     if spelled in _NO:
         return False
     raise SourceError(f"found {value!r}; expected 1 or 0, true or false", file=file, field=name)
+
+
+def _shown(value: Any) -> str:
+    # Matrices of a calibration file are arrays by now.
+    shown = json.dumps(value, default=str)
+    return shown if len(shown) <= _LONGEST_SHOWN else f"{shown[:_LONGEST_SHOWN]} ..."
 
 
 def _is_more_than_nothing(value: Any) -> bool:

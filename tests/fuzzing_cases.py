@@ -104,6 +104,18 @@ def transforms_ascii(folder: Path) -> Path:
     return folder
 
 
+def transforms_of_splits(folder: Path) -> Path:
+    """A file for each split, as synthetic scenes have them."""
+    write_transforms(sequence(), folder)
+    content = json.loads((folder / "transforms.json").read_text())
+    (folder / "transforms.json").unlink()
+    of_all = {key: value for key, value in content.items() if not key.endswith("_filenames")}
+    for name, frames_of_split in (("train", content["frames"][1:]), ("test", content["frames"][:1])):
+        text = json.dumps({**of_all, "frames": frames_of_split})
+        (folder / f"transforms_{name}.json").write_text(text)
+    return folder
+
+
 def colmap(*, binary: bool) -> Callable[[Path], Path]:
     """COLMAP's workspace."""
 
@@ -293,6 +305,7 @@ CASES: dict[str, Case] = {
     "depth.png": Case(posed("png"), "depth/1.png", source),
     "depth.tiff": Case(posed("tiff"), "depth/1.tiff", source),
     "transforms.json": Case(transforms, "transforms.json", source),
+    "transforms_test.json": Case(transforms_of_splits, "transforms_test.json", source),
     "points.ply": Case(transforms, "points.ply", source),
     "points-ascii.ply": Case(transforms_ascii, "points.ply", source),
     "cameras.bin": Case(colmap(binary=True), f"{_MODEL}cameras.bin", source),

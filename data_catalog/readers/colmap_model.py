@@ -17,8 +17,9 @@ COLMAP's poses are camera-from-world in OpenCV axes with pixel centres at +0.5; 
 reading and nothing else is turned or scaled. Every model of `extrags.lens` is understood; images of
 distorted cameras are resampled to a pinhole, those of pinhole cameras are taken as they are. Of several
 models (`sparse/0`, `sparse/1`, ...) the one with the most images is read. The sparse points become the
-starting points. Images that the model does not name have no pose and are left out, which the log says; so it
-does of frames without a mask where others have one. Frames without a mask are tissue throughout.
+starting points; those that are not finite are left out, with a warning. Images that the model does not name
+have no pose and are left out, which the log says; so it does of frames without a mask where others have one.
+Frames without a mask are tissue throughout.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from jaxtyping import Float, UInt8
 from data_catalog.calibration_files import LENS_OF_POSES
 from data_catalog.folder_reader import FolderReader
 from data_catalog.images import save_images
-from data_catalog.inside import inside
+from data_catalog.inside import inside, with_slashes
 from data_catalog.pose_conventions import PoseConvention
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from data_catalog.readers.beside_frames import tell_about_folders
@@ -47,6 +48,7 @@ from data_catalog.readers.colmap_files import (
     write_model,
 )
 from data_catalog.readers.frame_list import FilesBeside, listed_split, present_frames, warn_of_unmasked
+from data_catalog.readers.sparse_points import finite_points
 from extrags.cameras import pixel_rays
 from extrags.config import IngestConfig
 from extrags.errors import SourceError, SourceNotFoundError
@@ -121,7 +123,7 @@ def _image_root(folder: Path, names: list[str]) -> Path:
 def _lies_in(place: Path, name: str) -> bool:
     # An absolute name is the same file whatever folder it is looked for in.
     root = os.path.abspath(place)
-    file = os.path.normpath(os.path.join(root, name))
+    file = os.path.normpath(os.path.join(root, with_slashes(place, name, file=place)))
     return file.startswith(os.path.join(root, "")) and os.path.isfile(file)
 
 
@@ -226,21 +228,22 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
         )
         for image, item, parent in zip(images, used, folders, strict=True)
     ]
+    points, points_rgb = finite_points(model.points, model.points_rgb, pose_file.with_stem("points3D"))
     return SourceFrames(
         frames,
         pose_file=pose_file,
         metric=_is_metric(folder),
-        intrinsics_file=pose_file,
+        intrinsics_file=pose_file.with_stem("cameras"),
         lens_stays=LENS_OF_POSES,
         read_depth=lambda file, frame: read_depth_map(file, frame=frame),
-        points=model.points if len(model.points) else None,
-        points_rgb=model.points_rgb if len(model.points) else None,
+        points=points,
+        points_rgb=points_rgb,
     )
 
 
 READER = FolderReader(
     name="colmap",
-    version=6,
+    version=7,
     summary="a COLMAP model in sparse/0/ with images/, described in data_catalog/readers/colmap_model.py",
     recognises=_recognises,
     files=_files,

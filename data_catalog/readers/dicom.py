@@ -7,8 +7,9 @@ How frames are chosen and what is masked: `data_catalog.readers.footage_frames`.
 
 Read are uncompressed and JPEG-compressed pixels (whatever pydicom decodes with Pillow), and the streams of
 MPEG-2, MPEG-4 and HEVC that video endoscopes store, which go to the reader of videos. Colours: RGB, YBR_FULL,
-YBR_FULL_422, MONOCHROME2; of more than 8 bits the highest 8. Timestamps: Frame Time Vector, Frame Time, Cine
-Rate or Recommended Display Frame Rate. Pixels that are not square stay as they are; the intrinsics say so.
+YBR_FULL_422, YBR_RCT and YBR_ICT (both of JPEG 2000), MONOCHROME2; of more than 8 bits the highest 8.
+Timestamps: Frame Time Vector, Frame Time, Cine Rate or Recommended Display Frame Rate. Pixels that are not
+square stay as they are; the intrinsics say so.
 
 Nothing of a file but its pixels, their format and their timing is looked at: names and dates of patients stay
 where they are. What is burnt into the picture is masked as in a video, not removed.
@@ -64,7 +65,8 @@ _LOOKED_AT = (
     "CineRate",
     "RecommendedDisplayFrameRate",
 )
-_COLORS = ("RGB", "YBR_FULL", "YBR_FULL_422", "MONOCHROME2")
+_COLORS = ("RGB", "YBR_FULL", "YBR_FULL_422", "YBR_RCT", "YBR_ICT", "MONOCHROME2")
+"""Those of JPEG 2000, RCT and ICT, become RGB where it is decoded."""
 _USUAL_FRAMES_PER_S = 25.0
 _PIXEL_ELEMENT_BYTES = 12
 """Tag, representation and length of the pixel data, in all compressed syntaxes."""
@@ -261,7 +263,7 @@ def _footage(place: Path, config: IngestConfig) -> Footage:
 
 READER = FolderReader(
     name="dicom",
-    version=7,
+    version=8,
     summary="a DICOM multi-frame file (dcm), optionally with intrinsics.json and mask.png beside it",
     recognises=_recognises,
     files=_files,

@@ -10,9 +10,10 @@ camera are read (`data_catalog.readers.stereo_frames`).
 What is depth or a mask of a frame by its name is left out, and what tells of poses is not read, both with a
 warning (`data_catalog.readers.beside_frames`).
 
-Optional beside them: `intrinsics.json` with `K` (3 x 3), or `fx`, `fy`, `cx`, `cy`, or `field_of_view_deg`
-(horizontal), in pixels of the upright images with centres at +0.5, of a pinhole; and `mask.png` (white is
-tissue), of upright images too.
+Optional in the folder: `intrinsics.json` with `K` (3 x 3), or `fx`, `fy`, `cx`, `cy`, or `field_of_view_deg`
+(horizontal), in pixels of the upright images with centres at +0.5, of a pinhole, and the size of the images
+(`width` and `height`, or the names that calibration files have for it), which is checked; and `mask.png`
+(white is tissue), of upright images too.
 Without intrinsics a horizontal field of view of 90 degrees is assumed, and said so in the log: the sequence's
 intrinsics are `guessed`, and the poses stage estimates them, lens distortion included. A calibration file
 (`ingest.calibration`) takes the place of both, and `intrinsics.json` is then not read. Without a mask, the
@@ -45,7 +46,6 @@ from data_catalog.images import (
     upright_size,
 )
 from data_catalog.interlacing import is_combed, is_interlaced
-from data_catalog.lens_entries import check_pinhole
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from data_catalog.readers.beside_frames import (
     check_one_format,
@@ -55,6 +55,7 @@ from data_catalog.readers.beside_frames import (
     tell_about_pictures,
     tell_what_is_not_read,
 )
+from data_catalog.readers.intrinsics_entries import PINHOLE_KEYS, check_described, number_of
 from data_catalog.readers.stereo_frames import (
     FramesOfCamera,
     StereoFolders,
@@ -62,6 +63,7 @@ from data_catalog.readers.stereo_frames import (
     stereo_folders,
     views_in_pictures,
 )
+from data_catalog.readers.transforms_files import tell_about_lists_above
 from data_catalog.sampling import Sampling
 from data_catalog.stereo import BothViews
 from extrags.config import IngestConfig
@@ -90,9 +92,7 @@ FEWEST_FRAMES = 4
 """Fewer stills beside a video are pictures about it: poses could not be estimated from them."""
 _CLEARLY_MORE = 2
 _LOOKED_AT_FOR_COMBS = 12
-_PINHOLE = ("fx", "fy", "cx", "cy")
 _EXPECTED = "expected K, or fx, fy, cx, cy, or field_of_view_deg"
-_SIZES = (("width", "height"), ("w", "h"))
 
 
 def is_mask(file: Path) -> bool:
@@ -209,6 +209,7 @@ def _tell_what_is_passed_over(folder: Path, read: FramesOfCamera) -> None:
             )
     tell_about_pictures(folder, frames_among(_pictures(files[0].parent))[1])
     tell_what_is_not_read(folder)
+    tell_about_lists_above(folder)
     if footage := _footage(folder):
         logger.warning(
             "%s: %d images are read, and not %s; give its path to read that instead",
@@ -247,6 +248,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
         pixel_aspect=pixel_aspect,
         is_used=config.calibration is None,
         are_turned=orientation(files[0]) != UPRIGHT,
+        images=files[0].parent,
     )
     lens = Lens.pinhole(K, width, height)
     mask_file = mask_beside(folder, files[0].parent)
@@ -328,7 +330,7 @@ def _order(folder: Path) -> dict[str, Any]:
 
 READER = FolderReader(
     name="frames",
-    version=9,
+    version=10,
     summary="plain images in the folder, in images/ or in rgb/, optionally with intrinsics.json and mask.png",
     recognises=_recognises,
     files=_files,
@@ -352,6 +354,7 @@ def read_intrinsics(
     pixel_aspect: float = 1.0,
     is_used: bool = True,
     are_turned: bool = False,
+    images: Path | None = None,
 ) -> Float[np.ndarray, "3 3"]:
     """K from `intrinsics.json` in a folder, or of the assumed field of view where there is none.
 
@@ -363,11 +366,20 @@ def read_intrinsics(
         is_used: false where a calibration file takes the place of the result: nothing is read then, nor
             warned of.
         are_turned: whether width and height are those of images that lie otherwise in their files.
+        images: folder of the images; a file there is not read, which a warning says. None for the same.
 
     Raises:
         SourceError: the file is damaged or describes no pinhole.
     """
     file = folder / INTRINSICS_FILE
+    beside = (images or folder) / INTRINSICS_FILE
+    if is_used and beside != file and beside.is_file():
+        logger.warning(
+            "%s is not read; intrinsics are read from %s",
+            beside,
+            file,
+            extra={"topic": "not read", "field": "files"},
+        )
     if not is_used and file.is_file():
         logger.info("%s is not read: ingest.calibration takes its place", file)
     if not is_used or not file.is_file():
@@ -385,11 +397,11 @@ def read_intrinsics(
         content = json.loads(file.read_text(encoding="utf-8-sig"))
         if not isinstance(content, dict):
             raise TypeError(f"found {type(content).__name__}, not an object")
-        _check_described(content, width, height, file, are_turned=are_turned)
+        check_described(content, width, height, file, are_turned=are_turned)
         if "K" in content:
             K = np.asarray(content["K"], dtype=np.float64)
         elif "field_of_view_deg" in content:
-            angle = _number(content, "field_of_view_deg", file)
+            angle = number_of(content, "field_of_view_deg", file)
             if not 1 < angle < 179:
                 raise SourceError(
                     f"{angle:g} degrees; expected 1 to 179 for a pinhole",
@@ -399,7 +411,7 @@ def read_intrinsics(
             K = intrinsics_of_field_of_view(angle, width, height, pixel_aspect=pixel_aspect)
         else:
             _check_complete(content, file)
-            fx, fy, cx, cy = (_number(content, key, file) for key in _PINHOLE)
+            fx, fy, cx, cy = (number_of(content, key, file) for key in PINHOLE_KEYS)
             K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
     except SourceError:
         raise
@@ -417,36 +429,10 @@ def _check_complete(content: dict[str, Any], file: Path) -> None:
     Raises:
         SourceError: names what is missing.
     """
-    absent = [key for key in _PINHOLE if key not in content]
+    absent = [key for key in PINHOLE_KEYS if key not in content]
     if absent:
         listed = ", ".join(absent)
-        missing = f"no K, no field_of_view_deg and no {listed}" if absent == [*_PINHOLE] else f"no {listed}"
+        missing = (
+            f"no K, no field_of_view_deg and no {listed}" if absent == [*PINHOLE_KEYS] else f"no {listed}"
+        )
         raise SourceError(f"{missing}; {_EXPECTED}", file=file, field="K")
-
-
-def _number(content: dict[str, Any], key: str, file: Path) -> float:
-    try:
-        return float(content[key])
-    except (OverflowError, TypeError, ValueError) as error:
-        raise SourceError(f"{json.dumps(content[key])}; expected a number", file=file, field=key) from error
-
-
-def _check_described(
-    content: dict[str, Any], width: int, height: int, file: Path, *, are_turned: bool
-) -> None:
-    """Refuse what would otherwise be passed over: a lens that is no pinhole, and another size.
-
-    Raises:
-        SourceError: names the entry.
-    """
-    instead = "A lens with distortion is told by a calibration file (ingest.calibration)"
-    check_pinhole(content, instead, file=file)
-    for names in _SIZES:
-        told = [content.get(name) for name in names]
-        if None not in told and told != [width, height]:
-            as_shown = " once they are turned upright (EXIF orientation)" if are_turned else ""
-            raise SourceError(
-                f"for images of {told[0]} x {told[1]} pixels; found {width} x {height}{as_shown}",
-                file=file,
-                field=names[0],
-            )

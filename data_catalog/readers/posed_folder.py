@@ -125,7 +125,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
 
 READER = FolderReader(
     name="extrags",
-    version=6,
+    version=7,
     summary=f"{POSES_FILE} with rgb/ (and depth/, mask/), described in data_catalog/readers/posed_folder.py",
     recognises=_recognises,
     files=_files,

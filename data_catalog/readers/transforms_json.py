@@ -1,17 +1,24 @@
 """Reader and writer of `transforms.json`, the format of nerfstudio and instant-ngp.
 
 Read: `transform_matrix` (camera to world, OpenGL axes: y up, z backward; turned to OpenCV's on reading and
-nothing else), `fl_x`, `fl_y` or `camera_angle_x`, `camera_angle_y`, `cx`, `cy`, `w`, `h`, `k1` to `k4`, `p1`,
-`p2`, `camera_model` or `is_fisheye`, each for all frames or in a frame of its own; `file_path` (its suffix
-may be missing; frames without a file are left out, with a warning), `mask_path` (white is tissue),
-`depth_file_path` (of frames without one, or whose file is absent, depth is unknown, with a warning);
+nothing else), `fl_x`, `fl_y` (pixels), `x_fov`, `y_fov` (degrees) or `camera_angle_x`, `camera_angle_y`
+(radians; where one axis has none of the three, it has the focal length of the other), `cx`, `cy`, `w`, `h`,
+`k1` to `k4`, `p1`, `p2`, `camera_model` or `is_fisheye`, each for all frames or in a frame of its own;
+`file_path` (its suffix may be missing; frames without a file are left out, with a warning), `mask_path`
+(white is tissue), `depth_file_path` or `depth_path` (of frames without one, or whose file is absent, depth is
+unknown, with a warning);
 `train_filenames`, `test_filenames` and `val_filenames` (frames in none of them are left out); `ply_file_path`
-(points that are not finite are left out, with a warning). A `null` is as good as no value. Other keys are
-passed over; a warning names those that look misspelt or tell of distortion. Images of distorted cameras are
-resampled to a pinhole; a term of distortion that the camera's model has not is refused, unless it is 0.
+(points that are not finite are left out, with a warning). Where there is no such file but one for each split,
+as `transforms_train.json`, these are read (`data_catalog.readers.transforms_files`). A `null` is as good as
+no value. Other keys are passed over; a warning names those that look misspelt or tell of distortion. Images
+of distorted cameras are resampled to a pinhole; a term of distortion that the camera's model has not is
+refused, unless it is 0; so are instant-ngp's other cameras (`ftheta_p0` to `ftheta_p4`, `latlong`,
+`equirectangular`).
 
 Depth is z-depth; a value times `depth_unit_scale_factor` is in the unit of the poses. Where the file does not
-say, that is nerfstudio's 0.001 (or, for integers, instant-ngp's `integer_depth_scale`). 0 is unknown.
+say, that is nerfstudio's 0.001 (or, for integers, instant-ngp's `integer_depth_scale`). Files that
+`depth_path` names, instant-ngp's key, are read where instant-ngp reads them: with an `integer_depth_scale`
+above 0 (or that factor), and without `enable_depth_loading: false`. 0 is unknown.
 
 Lengths: `length_unit` (a key of ours: `mm`, `m` or `arbitrary`) says what a pose's 1 is; without it the scale
 is arbitrary. instant-ngp's `scale`, `offset` and `aabb_scale` and nerfstudio's `applied_transform` say how a
@@ -43,10 +50,23 @@ from data_catalog.inside import inside
 from data_catalog.pose_conventions import OPENGL
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from data_catalog.readers.beside_frames import frames_among, listed_files, tell_about_folders
-from data_catalog.readers.frame_list import listed_split, load_frame_list, matrix_of, present_frames
-from data_catalog.readers.transforms_lens import DISTORTION_KEYS, StatedLens
+from data_catalog.readers.frame_list import listed_split, matrix_of, present_frames
+from data_catalog.readers.sparse_points import read_ply_points, write_ply_points
+from data_catalog.readers.transforms_depth import (
+    DEPTH_FILE_KEYS,
+    DEPTH_KEYS,
+    NERFSTUDIO_DEPTH_SCALE,
+    depth_factor,
+    depth_files,
+)
+from data_catalog.readers.transforms_files import (
+    SPLIT_LISTS,
+    TRANSFORMS_FILE,
+    holds_transforms,
+    load_transforms,
+)
+from data_catalog.readers.transforms_lens import DISTORTION_KEYS, FOCAL_KEYS, StatedLens, stated_values
 from data_catalog.readers.unknown_keys import warn_of_unknown_keys
-from extrags.array_files import load_ply_vertices
 from extrags.config import IngestConfig
 from extrags.errors import PoseError, SourceError, SourceNotFoundError
 from extrags.frame_names import NameOrder, natural_key, order_for_fingerprint, tell_about_order
@@ -56,64 +76,47 @@ __all__ = ["READER", "TRANSFORMS_FILE", "write_transforms"]
 
 logger = logging.getLogger(__name__)
 
-TRANSFORMS_FILE = "transforms.json"
 _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-_NERFSTUDIO_DEPTH_SCALE = 1e-3
 _MM_PER_UNIT = {"mm": 1.0, "m": 1000.0, "arbitrary": 1.0}
-_FILE_KEYS = ("file_path", "mask_path", "depth_file_path")
+_FILE_KEYS = ("file_path", "mask_path", *DEPTH_FILE_KEYS)
 
 _KEYS = (
-    *("frames", "transform_matrix", "length_unit", "depth_unit_scale_factor", "integer_depth_scale"),
-    *("train_filenames", "test_filenames", "val_filenames", "ply_file_path", *_FILE_KEYS),
-    *("camera_model", "is_fisheye", "fl_x", "fl_y", "cx", "cy", "w", "h", *DISTORTION_KEYS),
-    *("camera_angle_x", "camera_angle_y"),
+    *("frames", "transform_matrix", "length_unit", *DEPTH_KEYS),
+    *(*SPLIT_LISTS, "ply_file_path", *_FILE_KEYS),
+    *("camera_model", "is_fisheye", "cx", "cy", "w", "h", *FOCAL_KEYS, *DISTORTION_KEYS),
 )
 """What is read, of all frames or of one."""
 _OTHER_KEYS = (
     *("scale", "offset", "aabb_scale", "applied_transform", "applied_scale", "orientation_override"),
     # Of a rolling shutter; the matrix of the frame as a whole stands beside them.
-    *("transform_matrix_start", "transform_matrix_end", "depth_path", "normal_file_path"),
+    *("transform_matrix_start", "transform_matrix_end", "normal_file_path"),
     *("lidar_file_path", "event_file_path", "thermal_file_path", "camera_id", "n_frames", "split_filenames"),
 )
 """What programs write, what changes nothing here, and is spelt like a key that does."""
 
 
-def _recognises(folder: Path) -> bool:
-    return (folder / TRANSFORMS_FILE).is_file()
-
-
-def _load(file: Path) -> dict[str, Any]:
-    """What the file holds, without keys whose value is null."""
-    content = load_frame_list(file, "file_path")
-    frames = [_stated(entry) for entry in content["frames"]]
-    return {**_stated(content), "frames": frames}
-
-
-def _stated(entry: dict[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in entry.items() if value is not None}
-
-
 def _files(folder: Path) -> list[Path]:
-    file = folder / TRANSFORMS_FILE
-    content = _load(file)
-    found = {file}
-    for entry in content["frames"]:
+    listed = load_transforms(folder)
+    found = {file for file, _ in listed.parts}
+    for entry in listed.content["frames"]:
+        name = entry["file_path"]
         for key in _FILE_KEYS:
             if isinstance(entry.get(key), str):
-                place = inside(folder, entry[key], file=file, frame=entry["file_path"], field=key)
+                place = inside(folder, entry[key], file=listed.file_of[name], frame=name, field=key)
                 found.add(_with_suffix(place))
-    if isinstance(content.get("ply_file_path"), str):
-        found.add(inside(folder, content["ply_file_path"], file=file, field="ply_file_path"))
+    if isinstance(listed.content.get("ply_file_path"), str):
+        name = listed.content["ply_file_path"]
+        found.add(inside(folder, name, file=listed.file, field="ply_file_path"))
     return sorted(file for file in found if file.is_file())
 
 
 def _chosen(folder: Path) -> dict[str, Any]:
-    return order_for_fingerprint(entry["file_path"] for entry in _load(folder / TRANSFORMS_FILE)["frames"])
+    return order_for_fingerprint(load_transforms(folder).file_of)
 
 
 def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
-    file = folder / TRANSFORMS_FILE
-    content = _load(file)
+    transforms = load_transforms(folder)
+    content, file, file_of = transforms.content, transforms.file, transforms.file_of
     unit = content.get("length_unit", "arbitrary")
     if not isinstance(unit, str) or unit not in _MM_PER_UNIT:
         raise SourceError(
@@ -121,36 +124,37 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
             file=file,
             field="length_unit",
         )
-    warn_of_unknown_keys(
-        content, known=_KEYS, known_of_frames=_KEYS, frame_name="file_path", file=file, others=_OTHER_KEYS
-    )
+    for part, held in transforms.parts:
+        warn_of_unknown_keys(
+            held, known=_KEYS, known_of_frames=_KEYS, frame_name="file_path", file=part, others=_OTHER_KEYS
+        )
     scale = _MM_PER_UNIT[unit]
-    order = NameOrder(entry["file_path"] for entry in content["frames"])
+    order = NameOrder(file_of)
     listed = sorted(content["frames"], key=lambda entry: order.key(entry["file_path"]))
     tell_about_order(file, order)
     files = {}
     for entry in listed:
         name = entry["file_path"]
-        files[name] = _with_suffix(inside(folder, name, file=file, frame=name, field="file_path"))
+        files[name] = _with_suffix(inside(folder, name, file=file_of[name], frame=name, field="file_path"))
     _check_apart(files, "file_path", "the image is listed twice, as {}", file)
     present = present_frames(files, config.max_absent_share, listing=file)
-    splits = _splits(content, file)
+    splits = transforms.splits or _splits(content, file)
     used = present & splits.keys() if splits else present
     entries = [entry for entry in listed if entry["file_path"] in used]
     folders = sorted({str(Path(entry["file_path"]).parent) for entry in entries}, key=natural_key)
-    depth_files = _depth_files(folder, entries)
+    depth_file_of = depth_files(content, entries, file)
     frames = []
     for entry in entries:
         frame = entry["file_path"]
-        place = files[frame]
+        place, listing = files[frame], file_of[frame]
         frames.append(
             PosedFrame(
                 name=str(Path(frame).relative_to("images")) if frame.startswith("images/") else frame,
                 file=place,
-                lens=StatedLens({**content, **entry}, file, frame).lens(place),
-                world_from_camera=_pose(entry, scale, file, frame),
-                mask_file=_mask_file(folder, entry, frame),
-                depth_file=depth_files[frame],
+                lens=StatedLens(stated_values(content, entry), listing, frame).lens(place),
+                world_from_camera=_pose(entry, scale, listing, frame),
+                mask_file=_mask_file(listing, entry, frame),
+                depth_file=depth_file_of[frame],
                 recording=folders.index(str(Path(frame).parent)),
                 split=splits.get(frame),
             )
@@ -165,7 +169,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     points, points_rgb = _points(folder, content, file)
 
     def depth_of(depth_file: Path, frame: str | int) -> Float[np.ndarray, "h w"]:
-        factor = _depth_factor(content, depth_file, file) * scale
+        factor = depth_factor(content, depth_file, file) * scale
         return (read_depth(depth_file, frame=frame) * factor).astype(np.float32)
 
     return SourceFrames(
@@ -182,10 +186,10 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
 
 READER = FolderReader(
     name="transforms",
-    version=6,
-    summary=f"{TRANSFORMS_FILE} of nerfstudio or instant-ngp, described in "
-    "data_catalog/readers/transforms_json.py",
-    recognises=_recognises,
+    version=7,
+    summary=f"{TRANSFORMS_FILE} of nerfstudio or instant-ngp, or transforms_train.json and its like, "
+    "described in data_catalog/readers/transforms_json.py",
+    recognises=holds_transforms,
     files=_files,
     frames=_frames,
     conventions="OpenGL camera axes (y up, z backward, turned on reading), camera to world; "
@@ -236,7 +240,7 @@ def write_transforms(
             place = folder / entry["depth_file_path"]
             place.parent.mkdir(parents=True, exist_ok=True)
             # In double precision, so that only the reader rounds.
-            np.save(place, sequence.depth_mm[index].astype(np.float64) / _NERFSTUDIO_DEPTH_SCALE)
+            np.save(place, sequence.depth_mm[index].astype(np.float64) / NERFSTUDIO_DEPTH_SCALE)
         frames.append({**entry, "transform_matrix": pose.tolist()})
     content: dict[str, Any] = {
         "camera_model": "PINHOLE" if sequence.lens is None else "OPENCV_FISHEYE",
@@ -244,6 +248,8 @@ def write_transforms(
         "frames": frames,
     }
     if sequence.lens is not None:
+        # nerfstudio goes by `camera_model`, and instant-ngp by this.
+        content["is_fisheye"] = True
         content |= dict(zip(("k1", "k2", "k3", "k4"), sequence.lens.coefficients, strict=True))
     if len(sequence.test):
         # nerfstudio evaluates on `val` while it trains and on `test` afterwards, and fails where a list is
@@ -252,7 +258,7 @@ def write_transforms(
             content[f"{name}_filenames"] = [frames[int(index)]["file_path"] for index in indices]
     if points is not None:
         content["ply_file_path"] = "points.ply"
-        _write_points(folder / "points.ply", points, points_rgb)
+        write_ply_points(folder / "points.ply", points, points_rgb)
     (folder / TRANSFORMS_FILE).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
@@ -293,33 +299,13 @@ def _tell_about_unlisted(file: Path, frames: list[PosedFrame], listed: Collectio
         )
 
 
-def _beside(folder: Path, entry: dict[str, Any], key: str) -> Path | None:
-    """The file that a frame names, which may be absent; None where it names none."""
-    if key not in entry:
+def _mask_file(listing: Path, entry: dict[str, Any], frame: str) -> Path | None:
+    if "mask_path" not in entry:
         return None
-    return inside(folder, str(entry[key]), file=folder / TRANSFORMS_FILE, frame=entry["file_path"], field=key)
-
-
-def _mask_file(folder: Path, entry: dict[str, Any], frame: str) -> Path | None:
-    file = _beside(folder, entry, "mask_path")
-    if file is not None and not file.is_file():
+    file = inside(listing.parent, str(entry["mask_path"]), file=listing, frame=frame, field="mask_path")
+    if not file.is_file():
         raise SourceNotFoundError("no such file", file=file, frame=frame, field="mask_path")
     return file
-
-
-def _depth_files(folder: Path, entries: list[dict[str, Any]]) -> dict[str, Path | None]:
-    """Depth of each frame, by its `file_path`; None where it names none, or one that is absent.
-
-    Raises:
-        SourceNotFoundError: all that are named are absent.
-    """
-    named = {entry["file_path"]: _beside(folder, entry, "depth_file_path") for entry in entries}
-    found = {frame: file if file is not None and file.is_file() else None for frame, file in named.items()}
-    if not any(found.values()):
-        for frame, file in named.items():
-            if file is not None:
-                raise SourceNotFoundError("no such file", file=file, frame=frame, field="depth_file_path")
-    return found
 
 
 def _pose(entry: dict[str, Any], scale: float, file: Path, frame: str) -> Float[np.ndarray, "4 4"]:
@@ -332,37 +318,21 @@ def _pose(entry: dict[str, Any], scale: float, file: Path, frame: str) -> Float[
     return pose
 
 
-def _depth_factor(content: dict[str, Any], depth_file: Path, file: Path) -> float:
-    if "depth_unit_scale_factor" in content:
-        key = "depth_unit_scale_factor"
-    elif "integer_depth_scale" in content and depth_file.suffix.lower() != ".npy":
-        key = "integer_depth_scale"
-    else:
-        return _NERFSTUDIO_DEPTH_SCALE
-    try:
-        factor = float(content[key])
-    except (OverflowError, TypeError, ValueError) as error:
-        raise SourceError(f"{content[key]!r}; expected a number", file=file, field=key) from error
-    if not np.isfinite(factor) or factor <= 0:
-        raise SourceError(f"{factor:g}; expected a positive number", file=file, field=key)
-    return factor
-
-
 def _splits(content: dict[str, Any], file: Path) -> dict[str, Literal["train", "test"]]:
     """Splits by `file_path`; empty where the file names none. Validation frames are held out too."""
-    for key in ("train_filenames", "test_filenames", "val_filenames"):
+    known = {entry["file_path"] for entry in content["frames"]}
+    listed: dict[str, list[str]] = {}
+    for key in SPLIT_LISTS:
         named = content.get(key) or []
         if not isinstance(named, list) or not all(isinstance(name, str) for name in named):
             raise SourceError("expected a list of file names", file=file, field=key)
-    held_out = [
-        name for key in ("test_filenames", "val_filenames") for name in content.get(key) or [] if name
-    ]
-    known = {entry["file_path"] for entry in content["frames"]}
-    training = content.get("train_filenames") or []
-    for listed in [*held_out, *sorted(training, key=natural_key)]:
-        if listed not in known:
+        listed[key] = [name if name in known else name.replace("\\", "/") for name in named]
+    held_out = [name for key in ("test_filenames", "val_filenames") for name in listed[key] if name]
+    training = listed["train_filenames"]
+    for name in [*held_out, *sorted(training, key=natural_key)]:
+        if name not in known:
             raise SourceError(
-                "the split names this frame, but `frames` does not", file=file, frame=listed, field="split"
+                "the split names this frame, but `frames` does not", file=file, frame=name, field="split"
             )
     return listed_split(known, training or None, held_out or None, file=file)
 
@@ -375,40 +345,4 @@ def _points(
     place = inside(folder, str(content["ply_file_path"]), file=file, field="ply_file_path")
     if not place.is_file():
         raise SourceNotFoundError("no such file", file=place, field="ply_file_path")
-    try:
-        vertices = load_ply_vertices(place)
-        located = np.stack([np.asarray(vertices[axis], dtype=np.float64) for axis in "xyz"], axis=1)
-    except (OSError, TypeError, ValueError) as error:
-        raise SourceError(f"no PLY with vertices: {error}", file=place, field="ply_file_path") from error
-    finite = np.isfinite(located).all(axis=1)
-    if not finite.all():
-        logger.warning(
-            "%s: %d of %d points are not finite and left out", place, int((~finite).sum()), len(located)
-        )
-    if not finite.any():
-        return None, None
-    names = set(vertices.dtype.names or ())
-    if not {"red", "green", "blue"} <= names:
-        return located[finite], None
-    colored = [vertices[name] for name in ("red", "green", "blue")]
-    if any(values.dtype.kind not in "fiu" for values in colored):
-        raise SourceError("colours are not numbers", file=place, field="ply_file_path")
-    shades = np.nan_to_num(np.stack(colored, axis=1)[finite]).clip(0, 255).astype(np.uint8)
-    return located[finite], shades
-
-
-def _write_points(
-    file: Path, points: Float[np.ndarray, "p 3"], points_rgb: UInt8[np.ndarray, "p 3"] | None
-) -> None:
-    from plyfile import PlyData, PlyElement
-
-    kinds = [(axis, "f8") for axis in "xyz"]
-    if points_rgb is not None:
-        kinds += [(name, "u1") for name in ("red", "green", "blue")]
-    rows = np.zeros(len(points), dtype=kinds)
-    for index, axis in enumerate("xyz"):
-        rows[axis] = points[:, index]
-    if points_rgb is not None:
-        for index, color in enumerate(("red", "green", "blue")):
-            rows[color] = points_rgb[:, index]
-    PlyData([PlyElement.describe(rows, "vertex")]).write(str(file))
+    return read_ply_points(place, field="ply_file_path")

@@ -106,7 +106,9 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
             file=folder / INTRINSICS_FILE,
             field="K",
         )
-    K = read_intrinsics(folder, width, height, is_used=config.calibration is None)
+    K = read_intrinsics(
+        folder, width, height, is_used=config.calibration is None, images=colours[0].file.parent
+    )
     lens, mask_file = Lens.pinhole(K, width, height), mask_beside(folder)
     if mask_file is None:
         tell_about_folders(folder, "mask", f"one {MASK_FILE} holds for all frames")
@@ -131,7 +133,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
 
 READER = FolderReader(
     name="tum",
-    version=1,
+    version=2,
     summary=f"{_COLOUR} with {_POSES} or {_DEPTH} of TUM's RGB-D layout, described in "
     "data_catalog/readers/tum.py",
     recognises=_recognises,

@@ -36,7 +36,7 @@ def warn_of_unknown_keys(
     A key that begins with `_` or `/` is a remark, and needs no warning.
 
     Args:
-        content: of the file, with a list `frames`.
+        content: of the file, with a list `frames` where it has some.
         known: keys beside `frames`, itself among them.
         known_of_frames: keys of a frame.
         frame_name: key of a frame that names it.
@@ -103,7 +103,7 @@ def _unknown(
     content: Mapping[str, Any], known: set[str], known_of_frames: set[str], frame_name: str
 ) -> Iterator[_UnknownKey]:
     """Keys beside the frames, then those of frames, each once."""
-    frames = content["frames"]
+    frames = content.get("frames", ())
     for name in _not_asked_for(content, known):
         key = _unknown_key(name, known, known_of_frames, "in each frame")
         key.about_lens = tells_distortion(name, content[name])

@@ -7,7 +7,7 @@ camera are read (`data_catalog.readers.stereo_footage`). Beside the file, both o
 assumed and said so until the poses stage estimates it, without the second the picture's outline and burnt-in
 text are found. How frames are chosen: `data_catalog.readers.footage_frames`.
 
-Frames are decoded by FFmpeg through PyAV: upright (a rotation in the container is applied), 8 bit a channel
+Frames are decoded by FFmpeg through PyAV: upright (turned and mirrored as the file says), 8 bit a channel
 whatever the depth of the file, at the timestamps of the container, which may be uneven. Where these go back,
 or jump by more than an hour, as where recordings were joined byte by byte, times count on. Pixels that are
 not square (standard definition) stay as they are; the intrinsics say so. Colours of a file that does not name
@@ -40,6 +40,7 @@ from data_catalog.readers.frames_folder import (
     places_with_frames,
 )
 from data_catalog.readers.stereo_footage import of_two_files
+from data_catalog.readers.video_header import Orientation, duration_of_pictures_s
 from data_catalog.stereo import pairs_by_name
 from extrags.config import IngestConfig
 from extrags.errors import SourceError, SourceNotFoundError
@@ -96,11 +97,9 @@ class VideoFile:
                 )
             self._frames_per_s = float(stream.average_rate or stream.guessed_rate or 0)
             self._start_s = float(stream.start_time * stream.time_base) if stream.start_time else 0.0
-            # Of some containers the time before the first frame is part of the duration. Of the others this
-            # expects too few frames, which only makes the check for a truncated file more lenient.
-            duration_s = max(0.0, container.duration / 1e6 - self._start_s) if container.duration else 0.0
             # Where the container does not count its frames, what a steady rate would give.
-            self._announced = stream.frames or round(duration_s * self._frames_per_s)
+            expected = duration_of_pictures_s(container, stream, self._start_s) * self._frames_per_s
+            self._announced = stream.frames or round(expected)
             if _COUNTS_WHAT_IS_HIDDEN in container.format.name and stream.duration:
                 shown_s = float(stream.duration * stream.time_base)
                 self._announced = min(self._announced, round(shown_s * self._frames_per_s))
@@ -109,18 +108,14 @@ class VideoFile:
                 self._announced = min(self._announced, file.stat().st_size // _ITS_PACKET_BYTES)
             aspect = float(stream.sample_aspect_ratio or 1)
             first = next(_decoded(container, stream), None)
-            turned_deg = 0 if first is None else first.rotation
+            self._orientation = Orientation() if first is None else Orientation.of_frame(first)
             stored = stream if first is None else first
             self._size = int(stored.width), int(stored.height)
-        # Counterclockwise, as numpy turns.
-        self._quarter_turns = round(turned_deg / 90) % 4
         self._pixel_aspect = aspect
-        if self._quarter_turns % 2:
+        if self._orientation.swaps_axes:
             self._pixel_aspect, self._size = 1 / aspect, (self._size[1], self._size[0])
-        if self._quarter_turns:
-            logger.info(
-                "%s: turned by %d degrees, as the file says", self._file.name, -90 * self._quarter_turns % 360
-            )
+        if self._orientation != Orientation():
+            logger.info("%s: %s, as the file says", self._file.name, self._orientation)
 
     @property
     def file(self) -> Path:
@@ -172,7 +167,7 @@ class VideoFile:
                 if time_s >= span.end_s or (last is not None and number > last):
                     return
                 if time_s in span and (numbers is None or number in numbers):
-                    rgb = np.rot90(_colors(frame), self._quarter_turns)
+                    rgb = self._orientation.upright(_colors(frame))
                     yield FootageFrame(number, time_s, np.ascontiguousarray(rgb))
         if numbers is None:
             self._check_whole(count, clock.farthest_s)
@@ -343,7 +338,7 @@ def _footage(place: Path, config: IngestConfig) -> Footage:
 
 READER = FolderReader(
     name="video",
-    version=8,
+    version=9,
     summary="a video file (mp4, avi, mov, mkv, ...), optionally with intrinsics.json and mask.png beside it",
     recognises=_recognises,
     files=_files,

@@ -290,8 +290,8 @@ DAMAGES = {
     "COLMAP camera of another size": Damage(
         "text",
         line(SPARSE + "cameras.txt", 1, words({2: "192", 3: "154"})),
-        "the image has 96 x 77 pixels, but images.txt describes a camera of 192 x 154; the intrinsics belong "
-        "to images 2 times as large",
+        "the image has 96 x 77 pixels, but cameras.txt describes a camera of 192 x 154; the intrinsics "
+        "belong to images 2 times as large",
         "0000.png",
         "K",
     ),
@@ -337,7 +337,7 @@ DAMAGES = {
     "no focal length": Damage(
         "transforms",
         every_frame(lambda entry: [entry.pop("fl_x"), entry.pop("fl_y")]),
-        r"no focal length; expected fl_x \(pixels\) or camera_angle_x",
+        r"no focal length; expected fl_x \(pixels\), camera_angle_x",
         "images/0000.png",
         "fl_x",
         "transforms.json",

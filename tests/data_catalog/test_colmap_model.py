@@ -373,3 +373,35 @@ class TestPoints:
         file = tmp_path / "a.geometric.bin"
         file.write_bytes(b"3&2&1&" + np.arange(6, dtype="<f4").tobytes())
         np.testing.assert_array_equal(read_depth_map(file), np.arange(6, dtype=np.float32).reshape(2, 3))
+
+
+class TestModelsOfOtherPrograms:
+    def test_separators_of_windows(self, workspace) -> None:
+        expected = read(workspace)
+        rename_images(workspace, lambda name: name.replace("/", "\\"))
+        found = read(workspace)
+        assert found.frame_names == expected.frame_names
+        np.testing.assert_array_equal(found.mask, expected.mask)
+        np.testing.assert_array_equal(found.depth_mm, expected.depth_mm)
+        np.testing.assert_array_equal(found.recording, expected.recording)
+
+    @pytest.mark.parametrize("binary", [True, False])
+    def test_points_that_are_not_finite(self, clip, tmp_path, caplog, binary) -> None:
+        points = np.arange(60.0).reshape(20, 3)
+        points[3, 1], points[7, 0] = np.nan, np.inf
+        colors = np.repeat(np.arange(20, dtype=np.uint8)[:, None], 3, axis=1)
+        write_colmap(clip, tmp_path, binary=binary, points=points, points_rgb=colors)
+        found = read(tmp_path)
+        kept = [index for index in range(20) if index not in (3, 7)]
+        assert found.points_rgb[:, 0].tolist() == kept
+        np.testing.assert_array_equal(found.points, points[kept])
+        name = "points3D.bin" if binary else "points3D.txt"
+        assert f"{name}: 2 of 20 points are not finite and left out" in caplog.text
+        write_colmap(clip, tmp_path, binary=binary, points=np.full((2, 3), np.nan))
+        assert read(tmp_path).points is None
+
+    def test_the_size_of_a_camera_stands_in_another_file(self, workspace) -> None:
+        for file in (workspace / "images").rglob("*.png"):
+            Image.open(file).resize((48, 38)).save(file)
+        with pytest.raises(SourceError, match=r"but cameras\.bin describes a camera of 96 x 77"):
+            read(workspace)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from data_catalog.catalog import read, resolve, source_fingerprint
 from data_catalog.footage import TimeSpan
@@ -176,3 +178,55 @@ class TestRefused:
         monkeypatch.setattr("data_catalog.readers.dicom.find_spec", lambda name: None)
         with pytest.raises(MissingDependencyError, match=r"pip install -e '\.\[dicom\]'"):
             read(file)
+
+
+class TestJpeg2000:
+    """Whose transform of colours is undone where the frames are decoded."""
+
+    @pytest.mark.parametrize(
+        ("colors", "lossless", "tolerance"), [("YBR_RCT", True, 0), ("RGB", True, 0), ("YBR_ICT", False, 12)]
+    )
+    def test_colours(self, scene, tmp_path, colors, lossless, tolerance) -> None:
+        from pydicom.uid import JPEG2000, JPEG2000Lossless
+
+        syntax = JPEG2000Lossless if lossless else JPEG2000
+        scene = np.ascontiguousarray(scene[:3] * [1.0, 0.6, 0.4] + [0, 10, 30]).astype(np.uint8)  # coloured
+        coded = [jpeg2000(image, lossless=lossless) for image in scene]
+        file = write_compressed(tmp_path / "a.dcm", scene, coded, str(syntax), colors)
+        for numbers in (None, [0, 2], [1]):
+            wanted = range(len(scene)) if numbers is None else numbers
+            found = list(open_dicom(file).frames(TimeSpan(), numbers))
+            assert [frame.number for frame in found] == list(wanted)
+            for frame in found:
+                apart = np.abs(frame.rgb.astype(int) - scene[frame.number])
+                assert apart.max() <= tolerance
+
+
+def jpeg2000(image: np.ndarray, *, lossless: bool) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(
+        buffer,
+        "JPEG2000",
+        no_jp2=True,
+        mct=1,
+        irreversible=not lossless,
+        quality_mode="rates",
+        quality_layers=[0 if lossless else 2],
+    )
+    return buffer.getvalue()
+
+
+def write_compressed(file: Path, frames: np.ndarray, coded: list[bytes], syntax: str, colors: str) -> Path:
+    """A multi-frame file with frames that were compressed elsewhere."""
+    from pydicom import dcmread
+    from pydicom.encaps import encapsulate
+    from pydicom.uid import UID
+
+    write_dicom(file, frames, colors="YBR_FULL", jpeg=True)
+    dataset = dcmread(file)
+    dataset.file_meta.TransferSyntaxUID = UID(syntax)
+    dataset.PhotometricInterpretation = colors
+    dataset.PixelData = encapsulate(coded)
+    dataset["PixelData"].is_undefined_length = True
+    dataset.save_as(file, enforce_file_format=True)
+    return file

@@ -1,0 +1,114 @@
+"""`intrinsics.json` beside plain frames, videos and lists: what it says is not passed over."""
+
+from __future__ import annotations
+
+import json
+import logging
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from data_catalog.catalog import read
+from data_catalog.inspection import inspect
+from data_catalog.readers.frames_folder import read_intrinsics
+from extrags.errors import SourceError
+
+WIDTH, HEIGHT = 48, 32
+K = [[40.0, 0, 24], [0, 40.0, 16], [0, 0, 1]]
+
+
+@pytest.fixture
+def stated(tmp_path):
+    """K from a file with other entries."""
+
+    def found(**entries) -> np.ndarray:
+        (tmp_path / "intrinsics.json").write_text(json.dumps({"K": K, **entries}))
+        return read_intrinsics(tmp_path, WIDTH, HEIGHT)
+
+    return found
+
+
+SIZES = [
+    *({first: WIDTH, second: HEIGHT} for first, second in (("width", "height"), ("w", "h"))),
+    *(
+        {first: WIDTH, second: HEIGHT}
+        for first, second in (("Width", "Height"), ("imageWidth", "imageHeight"))
+    ),
+    {"image_width": WIDTH, "image_height": HEIGHT},
+    *({name: [WIDTH, HEIGHT]} for name in ("image_size", "imageSize", "img_size", "resolution")),
+    {"resolution": f"{WIDTH}x{HEIGHT}"},
+]
+
+
+class TestSizes:
+    @pytest.mark.parametrize("told", SIZES, ids=str)
+    def test_the_same(self, stated, caplog, told) -> None:
+        np.testing.assert_array_equal(stated(**told), K)
+        assert not caplog.messages
+
+    @pytest.mark.parametrize("told", SIZES, ids=str)
+    def test_another_is_refused(self, stated, told) -> None:
+        def twice(value):
+            if isinstance(value, str):
+                return f"{2 * WIDTH}x{2 * HEIGHT}"
+            return [2 * size for size in value] if isinstance(value, list) else 2 * value
+
+        with pytest.raises(SourceError, match="for images of 96 x 64 pixels; found 48 x 32") as caught:
+            stated(**{name: twice(value) for name, value in told.items()})
+        assert caught.value.field == next(iter(told))
+
+    def test_one_of_the_two(self, stated) -> None:
+        stated(width=WIDTH)
+        with pytest.raises(SourceError, match=r"field image_height: for images of \? x 31 pixels"):
+            stated(image_height=31)
+
+    def test_programs_that_do_not_know_it(self, stated) -> None:
+        np.testing.assert_array_equal(stated(width=0, height=0, image_size=[0, 0], w=None), K)
+
+    @pytest.mark.parametrize("told", [{"resolution": "full"}, {"image_size": 48}, {"width": "wide"}], ids=str)
+    def test_no_size(self, stated, told) -> None:
+        with pytest.raises(SourceError, match="expected") as caught:
+            stated(**told)
+        assert caught.value.field == next(iter(told))
+
+
+class TestOtherEntries:
+    def test_skew(self, stated) -> None:
+        np.testing.assert_array_equal(stated(skew=0.0), K)
+        with pytest.raises(SourceError, match=r"field skew: 3\.0; expected 0"):
+            stated(skew=3.0)
+
+    def test_unknown_keys_are_told_of(self, stated, caplog) -> None:
+        with caplog.at_level(logging.WARNING):
+            stated(unit="normalized", _note="of Monday", distortion=[0, 0])
+        (said,) = caplog.messages
+        assert said.endswith("keys that are not known here are passed over: 'unit'")
+
+    def test_what_is_misspelt_is_a_finding(self, tmp_path) -> None:
+        texture = np.random.default_rng(0).integers(40, 255, (HEIGHT, WIDTH + 8, 3)).astype(np.uint8)
+        for number in range(4):
+            Image.fromarray(texture[:, number : number + WIDTH]).save(tmp_path / f"{number}.png")
+        (tmp_path / "intrinsics.json").write_text(json.dumps({"K": K, "feild_of_view_deg": 60}))
+        (found,) = (item for item in inspect(tmp_path).findings if item.topic == "unknown key")
+        assert found.field == "feild_of_view_deg"
+
+    def test_frames_are_no_entry_of_it(self, stated) -> None:
+        np.testing.assert_array_equal(stated(frames=3), K)
+
+
+class TestBesideTheImages:
+    @pytest.mark.parametrize("in_folder", [False, True])
+    def test_it_is_not_read_there(self, tmp_path, caplog, in_folder) -> None:
+        images = tmp_path / "images"
+        images.mkdir()
+        texture = np.random.default_rng(0).integers(40, 255, (HEIGHT, WIDTH + 8, 3)).astype(np.uint8)
+        for number in range(4):
+            Image.fromarray(texture[:, number : number + WIDTH]).save(images / f"{number}.png")
+        (images / "intrinsics.json").write_text(json.dumps({"K": K}))
+        if in_folder:
+            (tmp_path / "intrinsics.json").write_text(json.dumps({"K": K}))
+        found = read(tmp_path)
+        expected = f"{images / 'intrinsics.json'} is not read; intrinsics are read from {tmp_path}"
+        assert any(line.startswith(expected) for line in caplog.messages)
+        assert found.intrinsics == ("given" if in_folder else "guessed")
