@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -432,7 +431,7 @@ class EmbeddedEnhancer:
                 torch.Generator(),
                 generative=bool(description["generative"]),
             )
-            error_model = description["error_model"]
+            error_model, of_weights = description["error_model"], description["weights_calibration"]
             enhancer = cls(
                 network.eval(),
                 int(description["steps"]),
@@ -442,7 +441,7 @@ class EmbeddedEnhancer:
                 Gamut(**description["gamut"]),
                 dict(description["record"]),
                 ErrorModel(tuple(error_model["weights"]), float(error_model["offset"])),
-                _calibration_from(description["calibration"]),
+                Calibration.from_dict(description["calibration"]),
                 bool(description["deterministic"]),
                 bool(description["drawing"]),
                 _read_patches(weights_file.with_name(PATCHES)),
@@ -453,9 +452,7 @@ class EmbeddedEnhancer:
                 _read_untrained(weights_file.with_name(UNTRAINED)),
                 str(description["trained_on"]),
                 bool(description["seamless"]),
-                None
-                if description["weights_calibration"] is None
-                else _calibration_from(description["weights_calibration"]),
+                of_weights and Calibration.from_dict(of_weights),
             )
         try:
             network.load_state_dict(
@@ -464,10 +461,6 @@ class EmbeddedEnhancer:
         except (OSError, RuntimeError, ValueError) as error:
             raise WeightsError(f"{weights_file}: not the weights of this network ({error})") from error
         return enhancer
-
-
-def _calibration_from(entries: Mapping[str, Any]) -> Calibration:
-    return Calibration(**{name: tuple(values) for name, values in entries.items()})
 
 
 @cache

@@ -6,6 +6,7 @@ cells of pixels give a non-decreasing curve, which maps one to the other and kee
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -65,8 +66,13 @@ class Calibration:
         return np.asarray(inside * beyond, dtype=np.float32)
 
     def as_dict(self) -> dict[str, tuple[float, ...]]:
-        """For JSON."""
+        """For JSON; see `from_dict`."""
         return asdict(self)
+
+    @classmethod
+    def from_dict(cls, entries: Mapping[str, Sequence[float]]) -> Calibration:
+        """From what `as_dict` gave."""
+        return cls(**{name: tuple(values) for name, values in entries.items()})
 
 
 def non_decreasing(values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
