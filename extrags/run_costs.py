@@ -12,7 +12,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from importlib import resources
 from statistics import median
 from typing import TYPE_CHECKING, Any
@@ -246,8 +246,12 @@ class Workload:
 
     def term(self, name: str) -> float:
         """A product of numbers, e.g. `iterations*pixels`."""
-        numbers = self.numbers()
-        return math.prod(numbers[factor] for factor in name.split("*"))
+        return math.prod(self._known_numbers[factor] for factor in name.split("*"))
+
+    @cached_property
+    def _known_numbers(self) -> dict[str, float]:
+        """All terms of all tasks are made of the same."""
+        return self.numbers()
 
 
 @dataclass(frozen=True)

@@ -21,11 +21,14 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 check_arrays_alone()
 
-SHARING = ("tests/flows",)
-"""Packages whose tests share a server and a finished run."""
+PIPELINES = "tests/extrags/restoration/pretrained"
+SHARING = ("tests/flows", PIPELINES)
+"""Packages whose tests share a server and a finished run, or pipelines that are slow to import."""
+JOINING = {"tests/extrags/restoration/test_backends.py": PIPELINES}
+"""Files beside a package that share what its tests share."""
 LONG = (
     "tests/flows",
-    "tests/extrags/restoration/test_backends.py",
+    PIPELINES,
     "tests/extrags/poses/test_estimate.py",
     "tests/data_catalog/test_c3vd_scenes.py",
 )
@@ -54,7 +57,8 @@ def pytest_configure(config: pytest.Config) -> None:
 def group_of(nodeid: str) -> str:
     """What one process runs: a file, whose fixtures are made once, or a package that shares dearer ones."""
     file = nodeid.partition("::")[0]
-    return next((package for package in SHARING if file.startswith(f"{package}/")), file)
+    found = next((package for package in SHARING if file.startswith(f"{package}/")), file)
+    return JOINING.get(found, found)
 
 
 @pytest.hookimpl(optionalhook=True)

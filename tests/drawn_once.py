@@ -7,17 +7,25 @@ import hashlib
 import pickle
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from types import ModuleType
 from typing import Any
 from unittest.mock import patch
 
 import pytest
 
+import extrags.report.benchmark
 import extrags.report.build
 
 __all__ = ["DRAWN", "drawn_anew", "drawn_once"]
 
-DRAWN = ("gain_chart", "history_chart", "occupancy_slices", "scene_views", "views_chart")
-"""What the page of a sequence draws, as `extrags.report.build` names it."""
+DRAWN: tuple[tuple[ModuleType, str], ...] = (
+    *(
+        (extrags.report.build, name)
+        for name in ("gain_chart", "history_chart", "occupancy_slices", "scene_views", "views_chart")
+    ),
+    *((extrags.report.benchmark, name) for name in ("methods_chart", "pairs_chart", "trend_chart")),
+)
+"""What the pages of a sequence and of a benchmark draw, as their modules name it."""
 
 
 @contextmanager
@@ -37,13 +45,12 @@ def drawn_once() -> Iterator[None]:
         return known
 
     with ExitStack() as patched:
-        for name in DRAWN:
-            draw = getattr(extrags.report.build, name)
-            patched.enter_context(patch.object(extrags.report.build, name, once(draw)))
+        for module, name in DRAWN:
+            patched.enter_context(patch.object(module, name, once(getattr(module, name))))
         yield
 
 
 def drawn_anew(patched: pytest.MonkeyPatch) -> None:
     """Inside `drawn_once`, for a test of the drawing itself."""
-    for name in DRAWN:
-        patched.setattr(extrags.report.build, name, getattr(extrags.report.build, name).__wrapped__)
+    for module, name in DRAWN:
+        patched.setattr(module, name, getattr(module, name).__wrapped__)

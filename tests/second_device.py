@@ -8,7 +8,8 @@ a tensor that is not on the processor.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import functools
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 from unittest.mock import patch
@@ -77,6 +78,11 @@ class SecondDeviceTensor(Tensor):
 class _Factories(TorchDispatchMode):
     """What is made on, or carried to, the second device."""
 
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        # Nothing is compiled here, and keeping the compiler out costs every operation.
+        return False
+
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         return _done(func, args, kwargs or {})
 
@@ -105,28 +111,51 @@ def second_device() -> Iterator[torch.device]:
 
 
 def _done(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
-    name = func._schema.name.removeprefix("aten::")
-    tensors = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor)]
-    there = [tensor for tensor in tensors if isinstance(tensor, SecondDeviceTensor)]
-    here = [tensor for tensor in tensors if not isinstance(tensor, SecondDeviceTensor)]
+    name = _name(func)
+    there: list[Tensor] = []
+    here: list[Tensor] = []
+    _sort(args, there, here)
+    if kwargs:
+        _sort(kwargs.values(), there, here)
     _check(name, func, args, there, here)
     asked = kwargs.get("device")
+    if asked is None and not there:
+        # Most operations of a test, which does on the processor what the second device is compared with.
+        return func(*args, **kwargs)
+    given = {key: _values(value) for key, value in kwargs.items()}
     if asked is not None:
-        kwargs = {**kwargs, "device": torch.device("cpu")}
+        given["device"] = torch.device("cpu")
     on_device = bool(there) if asked is None else torch.device(asked) == DEVICE
     if name == "copy_":
         on_device = isinstance(args[0], SecondDeviceTensor)
-    found = func(*tree_map(_values, args), **tree_map(_values, kwargs))
+    found = func(*map(_values, args), **given)
     if name == "_local_scalar_dense":
         return found
     if on_device:
-        found = tree_map(_wrapped, found)
+        found = SecondDeviceTensor(found) if isinstance(found, Tensor) else tree_map(_wrapped, found)
     # Views share the storage of what they look at, and what was changed in place is itself again.
     return return_and_correct_aliasing(func, args, kwargs, found) if on_device and there else found
 
 
+@functools.cache
+def _name(func: Any) -> str:
+    name: str = func._schema.name
+    return name.removeprefix("aten::")
+
+
+def _sort(values: Iterable[Any], there: list[Tensor], here: list[Tensor]) -> None:
+    """Tensors among arguments, which nest no deeper than lists: a general walk takes most of the time."""
+    for value in values:
+        if isinstance(value, SecondDeviceTensor):
+            there.append(value)
+        elif isinstance(value, Tensor):
+            here.append(value)
+        elif isinstance(value, list | tuple):
+            _sort(value, there, here)
+
+
 def _check(name: str, func: Any, args: Any, there: Sequence[Tensor], here: Sequence[Tensor]) -> None:
-    if any(tensor.device == DEVICE for tensor in here):
+    if any(tensor.is_meta for tensor in here):
         raise MixedDevicesError(f"{name}: a tensor without values, made without a dispatched operation")
     if not there or not here or name in CARRIES:
         return
@@ -144,7 +173,9 @@ def _check(name: str, func: Any, args: Any, there: Sequence[Tensor], here: Seque
 
 
 def _values(value: Any) -> Any:
-    return value.held if isinstance(value, SecondDeviceTensor) else value
+    if isinstance(value, SecondDeviceTensor):
+        return value.held
+    return type(value)(map(_values, value)) if isinstance(value, list | tuple) else value
 
 
 def _wrapped(value: Any) -> Any:

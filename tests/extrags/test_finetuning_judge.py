@@ -33,6 +33,9 @@ COARSE = CoarseConfig(iterations=60, max_points=300, densify=DensifyConfig(max_g
 FINETUNE = FinetuneConfig(
     iterations=60, judge=JudgeConfig(iterations_share=1.0, views=4, leave_out_every=3, max_width=64)
 )
+BRIEF_COARSE = COARSE.model_copy(update={"iterations": 15})
+BRIEF = FINETUNE.model_copy(update={"iterations": 10})
+"""Where it does not matter how good the trials are."""
 ENHANCE = EnhanceConfig(backend="classical")
 WITHOUT_WEIGHTS = PerceptualDifference(None, "not in this test")
 
@@ -52,7 +55,8 @@ def trajectories() -> list[Cameras]:
 def judged(
     tube: Tube,
     enhancer: Enhancer | None,
-    config: FinetuneConfig = FINETUNE,
+    config: FinetuneConfig = BRIEF,
+    coarse: CoarseConfig = BRIEF_COARSE,
     *,
     measure: PerceptualDifference = WITHOUT_WEIGHTS,
 ) -> Judgement:
@@ -63,7 +67,7 @@ def judged(
         enhancer,
         config,
         ENHANCE,
-        COARSE,
+        coarse,
         measure=measure,
     )
 
@@ -117,24 +121,30 @@ def test_why_neither_holds() -> None:
 
 def test_a_restorer_that_destroys_is_left_out(tube: Tube) -> None:
     config = FINETUNE.model_copy(update={"keep_known": False})
-    destroyed = judged(tube, Destroyer(""), config)
+    destroyed = judged(tube, Destroyer(""), config, COARSE)
     assert destroyed.amount == 0.0 or destroyed.amount is None
     assert [trial.amount for trial in destroyed.trials] == [0.0, *AMOUNTS]
     control, full, *_ = destroyed.trials
     assert full.gain_db < control.gain_db - 0.1
     # What could be kept is tried as it would be run, which is what runs without a restorer.
-    assert judged(tube, None, config).trials[0] == control
+    assert judged(tube, None, config, COARSE).trials[0] == control
     without = config.model_copy(update={"light_cooldown_share": 0.0})
-    assert judged(tube, None, without).trials[0] != control
+    assert judged(tube, None, without, COARSE).trials[0] != control
 
 
 @pytest.mark.parametrize("starts", [[], [tube_cameras(1)]])
 def test_without_virtual_views_real_ones_alone_are_judged(tube: Tube, starts: list[Cameras]) -> None:
-    config = FINETUNE.model_copy(update={"iterations": 10})
     found = judge_finetuning(
-        tube.scene, tube.sequence, starts, Destroyer(""), config, ENHANCE, COARSE, measure=WITHOUT_WEIGHTS
+        tube.scene,
+        tube.sequence,
+        starts,
+        Destroyer(""),
+        BRIEF,
+        ENHANCE,
+        BRIEF_COARSE,
+        measure=WITHOUT_WEIGHTS,
     )
-    assert found == judged(tube, None, config)
+    assert found == judged(tube, None)
 
 
 class Trained(ClassicalEnhancer):
@@ -147,8 +157,7 @@ class Trained(ClassicalEnhancer):
 
 
 def test_a_restorer_does_not_restore_frames_that_it_was_trained_on(tube: Tube) -> None:
-    config = FINETUNE.model_copy(update={"iterations": 10})
-    assert judged(tube, Trained(""), config) == judged(tube, Destroyer(""), config)
+    assert judged(tube, Trained("")) == judged(tube, Destroyer(""))
 
 
 class Remembering(AsRendered):
@@ -183,8 +192,8 @@ def test_it_tells_how_much_of_restored_views_serves(tube: Tube, monkeypatch: pyt
         return restored_shares(*arguments, error_share=error_share, **others)
 
     monkeypatch.setattr(finetuning_judge, "restored_shares", keeping)
-    config = FINETUNE.model_copy(update={"iterations": 300})
-    found = judged(tube, AsRendered(), config)
+    config = FINETUNE.model_copy(update={"iterations": 100})
+    found = judged(tube, AsRendered(), config, COARSE)
     assert found.trials[-1].gain_db > 0.5
     assert found.restored_shares is not None
     # The coarse trial is worse than the fine-tuned one, whose errors are taken for even smaller.
@@ -266,7 +275,7 @@ def test_frames_are_compared_once_for_all_amounts(tube: Tube, monkeypatch: pytes
 
 def test_a_scene_that_is_kept(tube: Tube) -> None:
     """Real views alone change nothing of it, and the words say what was tried."""
-    found = judged(tube, None, FINETUNE.model_copy(update={"keep_scene": True}))
+    found = judged(tube, None, BRIEF.model_copy(update={"keep_scene": True}))
     assert [trial.gain_db for trial in found.trials] == [0.0]
     assert found.reason.startswith("the scene's own Gaussians stay as they are")
     assert "rebuilt from frames" in found.reason
@@ -283,7 +292,7 @@ def test_trials_too_small_for_lpips_are_judged_without(tube: Tube, monkeypatch: 
     monkeypatch.setattr(finetuning_judge, "restored_batches", told)
     monkeypatch.setattr(finetuning_judge, "MIN_LEFT_OUT", 1)
     raw = PerceptualDifference(Lpips("alex", random_weights("alex")), raw=True)
-    small = FINETUNE.model_copy(update={"judge": FINETUNE.judge.model_copy(update={"max_width": 24})})
+    small = BRIEF.model_copy(update={"judge": FINETUNE.judge.model_copy(update={"max_width": 24})})
     found = judged(tube, ClassicalEnhancer(""), small, measure=raw)
     assert found.trials
     assert {measure.name for measure in measures} == {"perceptual_map"}

@@ -57,14 +57,16 @@ class TestPlanningSettings:
                 except ConfigError:  # it does not go together with the others
                     continue
                 tried += 1
-                assert planning_settings(config).value(name) == other
+                planning = planning_settings(config)
+                assert planning.value(name) == other
                 for lacking in (0.0005, 0.02):
                     measured = {**LACKING, "lacking_share": lacking, "width": 640.0}
-                    assert decide(measured, planning_settings(config)) == decide(measured, config)
+                    assert decide(measured, planning) == decide(measured, config)
         assert tried > 0
 
     def test_hold_nothing_else(self):
         base = PROFILES["quick"]
+        planning = planning_settings(base)
         carried = set()
         for name, setting in KNOWN.items():
             for other in other_values(setting, base.value(name)):
@@ -72,7 +74,7 @@ class TestPlanningSettings:
                     config = base.with_overrides({name: other})
                 except ConfigError:
                     continue
-                if planning_settings(config) != planning_settings(base):
+                if planning_settings(config) != planning:
                     carried.add(name)
                 break
             else:

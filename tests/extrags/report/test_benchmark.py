@@ -13,6 +13,7 @@ from extrags.report.benchmark import BenchmarkInputs, ComparedViews, build_bench
 from extrags.report.charts import method_colors
 from extrags.report.comparison import RenderedMethod, compared_rows
 from extrags.sequence import EndoscopicSequence
+from tests.drawn_once import drawn_anew
 
 from .conftest import TEST, metrics_of
 from .pages import Page, decoded
@@ -104,7 +105,10 @@ def test_profiles_are_told_apart_in_words_and_charts() -> None:
         assert all(found == names for found in drawn)
 
 
-def test_is_one_file_and_the_same_twice(inputs: BenchmarkInputs, html: str) -> None:
+def test_is_one_file_and_the_same_twice(
+    inputs: BenchmarkInputs, html: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn_anew(monkeypatch)
     page = Page(html)
     assert page.loads
     assert all(load.startswith("data:image/") for load in page.loads)

@@ -46,14 +46,10 @@ class TestEmbedded:
         best = max((1, 4), key=lambda steps: scores[f"embedded_{steps}"]["psnr"])
         assert trained.steps == best
 
-    def test_training_twice_gives_the_same_bits(
-        self, tube: Tube, tube_pairs: Pairs, trained: EmbeddedEnhancer
-    ) -> None:
-        again = train_on_scene(tube_pairs, tube.references.transfer, SMALL)
-        for one, two in zip(
-            again.network.state_dict().values(), trained.network.state_dict().values(), strict=True
-        ):
-            assert torch.equal(one, two)
+    def test_training_twice_gives_the_same_bits(self, tube: Tube, tube_pairs: Pairs) -> None:
+        transfer, brief = tube.references.transfer, SMALL.model_copy(update={"train_iterations": 12})
+        first, second = (train_on_scene(tube_pairs, transfer, brief).network.state_dict() for _ in range(2))
+        assert all(torch.equal(value, second[name]) for name, value in first.items())
 
     def test_saved_and_loaded_it_restores_the_same(
         self, trained: EmbeddedEnhancer, clip: Clip, tmp_path
@@ -502,7 +498,8 @@ class TestEmbedded:
         assert len({*pairs.frame.tolist()}) == expected / 2
 
     def test_a_plain_regression_needs_no_noise(self, tube: Tube, tube_pairs: Pairs, clip: Clip) -> None:
-        plain = train_on_scene(tube_pairs, tube.references.transfer, SMALL, deterministic=True)
+        brief = SMALL.model_copy(update={"train_iterations": 12})
+        plain = train_on_scene(tube_pairs, tube.references.transfer, brief, deterministic=True)
         assert plain.steps == 1
         assert plain.record["validation"].keys() == {"none", "classical", "embedded_1"}
         assert np.array_equal(plain.restore(clip).rgb, replace(plain, seed=5).restore(clip).rgb)

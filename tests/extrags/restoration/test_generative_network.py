@@ -172,7 +172,7 @@ class TestAdversary:
         def seen(images: Tensor) -> tuple[Tensor, list[Tensor]]:
             return images, list(perceptual.activations(images.permute(0, 2, 3, 1)))
 
-        losses = [adversary.step(seen(smooth), seen(noisy), scene) for _ in range(25)]
+        losses = [adversary.step(seen(smooth), seen(noisy), scene) for _ in range(14)]
         assert losses[-1] < 0.6 * losses[0]
         deceived = [
             float(adversary.generator_loss(*seen(images), scene).detach()) for images in (smooth, noisy)
@@ -194,9 +194,9 @@ class TestTrainingOfDrawing:
     }
 
     def test_the_loss_of_drawn_views_falls(self, perceptual: Lpips) -> None:
-        settings = TrainingSettings(40, perceptual=perceptual, **self.SETTINGS)
+        settings = TrainingSettings(15, perceptual=perceptual, **self.SETTINGS)
         training = NetworkTraining(generative_network(), settings, seeded(3))
-        found = [training.step(batch()) for _ in range(40)]
+        found = [training.step(batch()) for _ in range(15)]
         assert found[-1]["drawn_loss"] < 0.8 * found[0]["drawn_loss"]
         assert all(np.isfinite(step["adversary"]) for step in found)
 

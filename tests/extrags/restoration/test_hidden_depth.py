@@ -31,7 +31,7 @@ HEIGHT, WIDTH = 48, 64
 
 def settings() -> PipelineConfig:
     quick = profile_config("quick")
-    explore = quick.explore.model_copy(update={"trajectories": 2, "steps": 3})
+    explore = quick.explore.model_copy(update={"trajectories": 2, "steps": 3, "render_width": 32})
     coarse = quick.coarse.model_copy(update={"max_points": 800})
     return quick.model_copy(update={"explore": explore, "coarse": coarse})
 
@@ -166,7 +166,7 @@ class TestTraining:
         start = load_completion("bundled")
         assert start is not None
         before = {name: value.clone() for name, value in start.state_dict().items()}
-        config = HiddenDepthConfig(scenes=3, validation_scenes=1, iterations=60, batch=4, learning_rate=2e-3)
+        config = HiddenDepthConfig(scenes=3, validation_scenes=1, iterations=20, batch=4, learning_rate=2e-3)
         network, record = train_hidden_depth(files, config, start)
         assert all(torch.equal(value, before[name]) for name, value in start.state_dict().items())
         assert not torch.equal(network.entrance.weight, start.entrance.weight)

@@ -33,7 +33,7 @@ RUN = QUICK.model_copy(
     update={
         "enhance": SMALL,
         "coarse": CoarseConfig(max_points=800),
-        "explore": QUICK.explore.model_copy(update={"trajectories": 2, "steps": 5}),
+        "explore": QUICK.explore.model_copy(update={"trajectories": 2, "steps": 5, "render_width": 32}),
     }
 )
 TINY = PretrainingConfig(
@@ -167,12 +167,12 @@ class TestPretrainingScene:
 
 class TestPretraining:
     def test_it_learns_and_says_how_well(self, files: list[Path], tmp_path: Path) -> None:
-        enhancer = pretrain(files, TINY.model_copy(update={"iterations": 60}))
+        enhancer = pretrain(files, TINY.model_copy(update={"iterations": 30}))
         scores = enhancer.record["validation_scores"]
         assert scores["embedded_1"]["psnr"] > scores["none"]["psnr"]
         enhancer.save(tmp_path, half=True)
         loaded = EmbeddedEnhancer.load(tmp_path / "restorer.safetensors")
-        assert loaded.record["pretraining"]["iterations"] == 60
+        assert loaded.record["pretraining"]["iterations"] == 30
         # What others than Python read as well: infinity is no number of JSON.
         json.loads((tmp_path / "restorer.json").read_text(), parse_constant=pytest.fail)
         for one, two in zip(

@@ -289,7 +289,7 @@ class TestTraining:
     def test_it_learns(self, files: list[Path], random_perception: Lpips) -> None:
         # Random perception would lead elsewhere.
         settings = {"perceptual_weight": 0.01, "adversarial_weight": 0.0, "pixel_weight": 1.0}
-        trained = train_refiner(files, self.config(40, **settings))
+        trained = train_refiner(files, self.config(20, **settings))
         scores = trained.record["validation_scores"]
         assert scores["refined"]["psnr"] > scores["textured"]["psnr"] + 2
         assert set(scores) == {"smooth", "textured", "refined"}
