@@ -147,6 +147,7 @@ DIRECTLY: dict[str, tuple[str, ...]] = {
 """Stages that read a setting, by its name; the first pattern that fits holds. All are on the page."""
 
 OTHERS: dict[str, Any] = {
+    "enhance.crop": 104,
     "ingest.downscale": 4,
     "ingest.calibration": None,
     "depth.completion": None,
