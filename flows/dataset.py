@@ -20,6 +20,7 @@ from extrags.store import Store
 from flows.cases import Only, SequenceCase, cases_of, record_outcome_quietly, selected
 from flows.damage import again_after_damage
 from flows.expectation import Expectation, expectations, expected_words, longest_first
+from flows.failures import release_locals
 from flows.leases import run_lease
 from flows.limits import DEFAULT_LIMITS, StageLimits
 from flows.methods import MethodName, profile_label
@@ -236,6 +237,8 @@ def outcome_of(sequence: str, state: State[Any]) -> SequenceOutcome:
     found = state.result(raise_on_failure=False)
     if isinstance(found, SequenceOutcome):
         return found
+    if isinstance(found, Exception):
+        release_locals(found)  # It is kept until the last sequence has ended.
     if isinstance(found, SequenceFailedError):
         return found.outcome
     # Not a stage but the run itself failed (a crash of its task runner, say).
