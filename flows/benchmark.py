@@ -31,7 +31,7 @@ from flows.history import (
 from flows.leases import run_lease
 from flows.limits import DEFAULT_LIMITS, StageLimits
 from flows.methods import METHODS, MethodName, method_config, pinned_settings
-from flows.outcome import NOT_COUNTED, SequenceOutcome
+from flows.outcome import MAX_FAILED_SHARE, NOT_COUNTED, BenchmarkFailedError, SequenceOutcome
 from flows.pages import benchmark_page, image_size
 from flows.parameters import Sequences, Settings, StoreRoot, Variants
 from flows.preflight import preflight
@@ -109,6 +109,9 @@ def benchmark(
             description="how much worse than the runs before it may be; without, it is not held against them"
         ),
     ] = None,
+    max_failed_share: Annotated[
+        float, Field(ge=0, le=1, description="the benchmark counts as failed when more of its runs failed")
+    ] = MAX_FAILED_SHARE,
 ) -> dict[str, Any]:
     """Measure every combination, and compare the methods pair by pair.
 
@@ -130,6 +133,7 @@ def benchmark(
             is wrong, or a tolerance for what is not measured anew.
         BenchmarkRegressedError: when it is worse than the runs before by more than `tolerance`; page, tables
             and history have been written by then.
+        BenchmarkFailedError: when more than `max_failed_share` of the runs failed; likewise.
         ExtragsError: when a model, weights or a package that the settings name is not there.
     """
     if tolerance is not None and not refresh:
@@ -196,6 +200,9 @@ def benchmark(
     }
     if accounts.judgement.regressions:
         raise BenchmarkRegressedError(name, result)
+    failed = sum(bool(case["error"]) for case in accounts.cases)
+    if failed / len(accounts.cases) > max_failed_share:
+        raise BenchmarkFailedError(name, result, max_failed_share)
     return result
 
 

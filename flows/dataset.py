@@ -25,6 +25,7 @@ from flows.leases import run_lease
 from flows.limits import DEFAULT_LIMITS, StageLimits
 from flows.methods import MethodName, profile_label
 from flows.outcome import (
+    MAX_FAILED_SHARE,
     DatasetFailedError,
     DatasetOutcome,
     SequenceFailedError,
@@ -48,9 +49,6 @@ from tasks.run_page import artifact_key, attempt
 __all__ = ["reconstruct_dataset"]
 
 log = logging.getLogger(__name__)
-
-MAX_FAILED_SHARE = 0.5
-"""When most sequences fail, it is hardly the sequences' fault."""
 
 
 @flow(name="reconstruct-dataset", flow_run_name="{name}", log_prints=False, persist_result=False)

@@ -25,6 +25,7 @@ from flows.history import (
     judge,
     trend,
 )
+from flows.outcome import BenchmarkFailedError
 from flows.tables import judgement_markdown
 from tests.flows.tiny import SEQUENCE, TINY
 
@@ -318,8 +319,13 @@ class TestFlow:
         assert again["cases"][0]["seconds"] == found[-1]["cases"][0]["seconds"]
         assert len(history_of(store, "weekly")) == 5
 
+    @pytest.mark.parametrize("failed", [False, True])
     def test_the_command_tells_what_was_measured_when_it_is_worse(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+        self,
+        tmp_path: Path,
+        monkeypatch: pytest.MonkeyPatch,
+        capsys: pytest.CaptureFixture[str],
+        failed: bool,
     ) -> None:
         found: dict[str, Any] = {
             "machine": {},
@@ -332,6 +338,8 @@ class TestFlow:
         def measured(**given: Any) -> dict[str, Any]:
             # What has no limit of its own is not judged.
             assert (given["tolerance"].psnr_db, given["tolerance"].seconds_share) == (None, 0.5)
+            if failed:
+                raise BenchmarkFailedError("weekly", found, 0.5)
             raise BenchmarkRegressedError("weekly", found)
 
         monkeypatch.setattr(
