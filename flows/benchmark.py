@@ -395,9 +395,10 @@ def case_of(case: Case) -> dict[str, Any]:
 
     `seconds` is what its stages took when they were made, without evaluation and report, `processor_seconds`
     the processor time of all threads meanwhile (None where an earlier version made one of them),
-    `spent_seconds` the part of `seconds` that was spent in this run; `peak_mib` is the
-    largest resident memory of the process; `evaluation` where the figures of each view are; `settings` those
-    that were given for its sequence beside the profile, and `image_size` width and height in px;
+    `spent_seconds` the part of `seconds` that was spent in this run, more where something was damaged and
+    made again; `peak_mib` is the largest resident memory of the process; `evaluation` where the figures of
+    each view are; `settings` those that were given for its sequence beside the profile, and `image_size`
+    width and height in px;
     `held_out_trained_on` is true of the oracle alone.
     """
     outcome = case.outcome

@@ -177,7 +177,7 @@ class CachedStages(Pipeline):
             row = StageRow(stage, "cached", reason="" if planned is None else planned.reason)
             before = self._before.get(stage)
             if before is not None:
-                row.seconds = before.seconds
+                row.seconds, row.spent_seconds = before.seconds, before.spent_seconds
                 row.state = "ran" if before.state == "ran" else "cached"
             self.outcome.stages.append(row)
         self._report_progress(row, "running")

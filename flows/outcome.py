@@ -46,7 +46,8 @@ class StageRow:
     made_seconds: float = 0.0
     """Time it took to compute its artefacts, in this or an earlier run."""
     spent_seconds: float = 0.0
-    """The part of `made_seconds` that was spent in this run; the rest is what cached artefacts once took."""
+    """The part of `made_seconds` that was spent in this run; the rest is what cached artefacts once took.
+    What was damaged and made again counts each time: then it may exceed `made_seconds`."""
     processor_seconds: float | None = None
     """Processor time of all threads while the artefacts were made, in this or an earlier run; None where an
     earlier version made one of them and did not measure it."""
