@@ -146,7 +146,8 @@ class TestAgain:
         self, tmp_path: Path, allowed: float | None, fails: bool
     ) -> None:
         (tmp_path / "empty").mkdir()
-        store, name = Store(tmp_path / "store"), f"none-{allowed}"
+        # Names may be as long as one likes.
+        store, name = Store(tmp_path / "store"), f"none-{allowed}{' of many' * 30}"
         state = benchmark(
             sequences=[str(tmp_path / "empty")],
             methods=["coarse", "3dgs"],

@@ -204,6 +204,15 @@ class TestRecords:
         assert len(history_of(store, "weekly!")) == 1
         assert history_of(store, "week") == []
 
+    def test_names_of_any_length_are_told_apart(self, tmp_path: Path) -> None:
+        store = Store(tmp_path)
+        names = ["long " * 60, "long " * 60 + "!", "long " * 60 + "er"]
+        for name in names:
+            append_history(store, {**entry(), "name": name})
+        assert [[item["name"] for item in history_of(store, name)] for name in names] == [
+            [name] for name in names
+        ]
+
     def test_the_trend_has_what_can_be_compared(self) -> None:
         drawn = trend(
             [entry(psnr=19, day=1, machine={"cores": 64}), entry(psnr=None, day=2), entry(psnr=20, day=3)]
