@@ -33,7 +33,7 @@ from flows.limits import DEFAULT_LIMITS, StageLimits
 from flows.methods import METHODS, MethodName, method_config, pinned_settings
 from flows.outcome import MAX_FAILED_SHARE, NOT_COUNTED, BenchmarkFailedError, SequenceOutcome
 from flows.pages import benchmark_page, image_size
-from flows.parameters import Sequences, Settings, StoreRoot, Variants
+from flows.parameters import DIFFERENT, Sequences, Settings, StoreRoot, Variants
 from flows.preflight import preflight
 from flows.run_page import run_page
 from flows.runners import PrefectRunner, Runner
@@ -75,12 +75,15 @@ def benchmark(
     sequences: Annotated[
         Sequences, Field(min_length=1, description="names, paths, patterns, or @FILE for a manifest")
     ],
-    profiles: Annotated[list[ProfileName], Field(min_length=1, description="named settings")] = ["quick"],  # noqa: B006
-    methods: Annotated[list[MethodName], Field(min_length=1, description="what to compare")] = [  # noqa: B006
-        "coarse",
-        "extrags",
-    ],
-    seeds: Annotated[list[Seed], Field(min_length=1, description="one run per seed")] = [0],  # noqa: B006
+    profiles: Annotated[
+        list[ProfileName], Field(min_length=1, description="named settings", json_schema_extra=DIFFERENT)
+    ] = ["quick"],  # noqa: B006
+    methods: Annotated[
+        list[MethodName], Field(min_length=1, description="what to compare", json_schema_extra=DIFFERENT)
+    ] = ["coarse", "extrags"],  # noqa: B006
+    seeds: Annotated[
+        list[Seed], Field(min_length=1, description="one run per seed", json_schema_extra=DIFFERENT)
+    ] = [0],  # noqa: B006
     settings: Annotated[
         Settings, Field(description="overrides for all runs; they do not reach what a method pins")
     ] = None,

@@ -33,7 +33,7 @@ from flows.outcome import (
     failed_outcome,
 )
 from flows.pages import dataset_page
-from flows.parameters import Matrix, Sequences, Settings, StoreRoot
+from flows.parameters import DIFFERENT, Matrix, RunnerName, Sequences, Settings, StoreRoot
 from flows.preflight import preflight_cases
 from flows.run_page import run_page
 from flows.runners import PrefectRunner, refreshed_once
@@ -64,7 +64,7 @@ def reconstruct_dataset(
     ] = None,
     refresh: Annotated[bool, Field(description="run every stage although its artefact is there")] = False,
     until: Annotated[StageName, Field(description="last stage to run")] = "report",
-    runner: Annotated[str, Field(description="threads, dask or dask:ADDRESS")] = "threads",
+    runner: Annotated[RunnerName, Field(description="threads, dask or dask:ADDRESS")] = "threads",
     at_once: Annotated[int, Field(ge=1, description="sequences in work at the same time")] = 1,
     name: Annotated[str, Field(description="name of this run, for its table")] = "dataset",
     method: Annotated[
@@ -78,10 +78,12 @@ def reconstruct_dataset(
         Only | None, Field(description="only those whose last run failed, that have changed, or never ended")
     ] = None,
     methods: Annotated[
-        list[MethodName] | None, Field(min_length=1, description="several methods instead of one")
+        list[MethodName] | None,
+        Field(min_length=1, description="several methods instead of one", json_schema_extra=DIFFERENT),
     ] = None,
     seeds: Annotated[
-        list[Seed] | None, Field(min_length=1, description="several seeds instead of one")
+        list[Seed] | None,
+        Field(min_length=1, description="several seeds instead of one", json_schema_extra=DIFFERENT),
     ] = None,
     matrix: Annotated[
         Matrix, Field(description='several values of settings, e.g. {"coarse.iterations": [500, 1000]}')
