@@ -31,9 +31,9 @@ from flows.history import (
 from flows.leases import run_lease
 from flows.limits import DEFAULT_LIMITS, StageLimits
 from flows.methods import METHODS, MethodName, method_config, pinned_settings
-from flows.outcome import NOT_COUNTED, SequenceOutcome
+from flows.outcome import MAX_FAILED_SHARE, NOT_COUNTED, BenchmarkFailedError, SequenceOutcome
 from flows.pages import benchmark_page, image_size
-from flows.parameters import Sequences, Settings, StoreRoot, Variants
+from flows.parameters import DIFFERENT, Sequences, Settings, StoreRoot, Variants
 from flows.preflight import preflight
 from flows.run_page import run_page
 from flows.runners import PrefectRunner, Runner
@@ -75,12 +75,15 @@ def benchmark(
     sequences: Annotated[
         Sequences, Field(min_length=1, description="names, paths, patterns, or @FILE for a manifest")
     ],
-    profiles: Annotated[list[ProfileName], Field(min_length=1, description="named settings")] = ["quick"],  # noqa: B006
-    methods: Annotated[list[MethodName], Field(min_length=1, description="what to compare")] = [  # noqa: B006
-        "coarse",
-        "extrags",
-    ],
-    seeds: Annotated[list[Seed], Field(min_length=1, description="one run per seed")] = [0],  # noqa: B006
+    profiles: Annotated[
+        list[ProfileName], Field(min_length=1, description="named settings", json_schema_extra=DIFFERENT)
+    ] = ["quick"],  # noqa: B006
+    methods: Annotated[
+        list[MethodName], Field(min_length=1, description="what to compare", json_schema_extra=DIFFERENT)
+    ] = ["coarse", "extrags"],  # noqa: B006
+    seeds: Annotated[
+        list[Seed], Field(min_length=1, description="one run per seed", json_schema_extra=DIFFERENT)
+    ] = [0],  # noqa: B006
     settings: Annotated[
         Settings, Field(description="overrides for all runs; they do not reach what a method pins")
     ] = None,
@@ -109,6 +112,9 @@ def benchmark(
             description="how much worse than the runs before it may be; without, it is not held against them"
         ),
     ] = None,
+    max_failed_share: Annotated[
+        float, Field(ge=0, le=1, description="the benchmark counts as failed when more of its runs failed")
+    ] = MAX_FAILED_SHARE,
 ) -> dict[str, Any]:
     """Measure every combination, and compare the methods pair by pair.
 
@@ -130,6 +136,7 @@ def benchmark(
             is wrong, or a tolerance for what is not measured anew.
         BenchmarkRegressedError: when it is worse than the runs before by more than `tolerance`; page, tables
             and history have been written by then.
+        BenchmarkFailedError: when more than `max_failed_share` of the runs failed; likewise.
         ExtragsError: when a model, weights or a package that the settings name is not there.
     """
     if tolerance is not None and not refresh:
@@ -196,6 +203,9 @@ def benchmark(
     }
     if accounts.judgement.regressions:
         raise BenchmarkRegressedError(name, result)
+    failed = sum(bool(case["error"]) for case in accounts.cases)
+    if failed / len(accounts.cases) > max_failed_share:
+        raise BenchmarkFailedError(name, result, max_failed_share)
     return result
 
 
@@ -388,9 +398,10 @@ def case_of(case: Case) -> dict[str, Any]:
 
     `seconds` is what its stages took when they were made, without evaluation and report, `processor_seconds`
     the processor time of all threads meanwhile (None where an earlier version made one of them),
-    `spent_seconds` the part of `seconds` that was spent in this run; `peak_mib` is the
-    largest resident memory of the process; `evaluation` where the figures of each view are; `settings` those
-    that were given for its sequence beside the profile, and `image_size` width and height in px;
+    `spent_seconds` the part of `seconds` that was spent in this run, more where something was damaged and
+    made again; `peak_mib` is the largest resident memory of the process; `evaluation` where the figures of
+    each view are; `settings` those that were given for its sequence beside the profile, and `image_size`
+    width and height in px;
     `held_out_trained_on` is true of the oracle alone.
     """
     outcome = case.outcome

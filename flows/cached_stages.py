@@ -17,6 +17,7 @@ from extrags.store import Manifest, Ref, Store, digest_of, forget_loaded
 from extrags.store.runs import RunRecord, recorded_run
 from flows.damage import again_after_damage
 from flows.estimate import expected_seconds
+from flows.failures import release_locals
 from flows.outcome import SequenceOutcome, StageRow
 from flows.runners import Call, NotInStoreError, Result, Runner, StoreRunner
 from flows.workloads import frames_work
@@ -84,6 +85,8 @@ class CachedStages(Pipeline):
             if not isinstance(error, _StoppedError):
                 last = self.outcome.stages[-1]
                 last.state, last.reason, self.outcome.error = "failed", str(error), error
+            # Outcomes, errors among them, are kept until the last sequence of a run has ended.
+            release_locals(error)
             self.outcome.status = "failed"
             done = {row.stage for row in self.outcome.stages}
             failed = self.outcome.stages[-1].stage
@@ -174,7 +177,7 @@ class CachedStages(Pipeline):
             row = StageRow(stage, "cached", reason="" if planned is None else planned.reason)
             before = self._before.get(stage)
             if before is not None:
-                row.seconds = before.seconds
+                row.seconds, row.spent_seconds = before.seconds, before.spent_seconds
                 row.state = "ran" if before.state == "ran" else "cached"
             self.outcome.stages.append(row)
         self._report_progress(row, "running")

@@ -8,6 +8,7 @@ from typing import TypeVar
 
 from extrags.errors import ArtefactGoneError, DamagedArtefactError
 from extrags.store import Store
+from flows.failures import release_locals
 
 __all__ = ["again_after_damage"]
 
@@ -40,6 +41,7 @@ def again_after_damage(store: Store, work: Callable[[], T]) -> T:
             if not error.key or error.key in met:
                 raise
             met.add(error.key)
+            release_locals(error)  # Error and context may hold each other, and so what the stage had read.
             if isinstance(error, DamagedArtefactError):
                 store.set_aside(error)
             log.warning("looking up all stages again, since %s", error)

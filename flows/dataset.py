@@ -20,10 +20,12 @@ from extrags.store import Store
 from flows.cases import Only, SequenceCase, cases_of, record_outcome_quietly, selected
 from flows.damage import again_after_damage
 from flows.expectation import Expectation, expectations, expected_words, longest_first
+from flows.failures import release_locals
 from flows.leases import run_lease
 from flows.limits import DEFAULT_LIMITS, StageLimits
 from flows.methods import MethodName, profile_label
 from flows.outcome import (
+    MAX_FAILED_SHARE,
     DatasetFailedError,
     DatasetOutcome,
     SequenceFailedError,
@@ -31,7 +33,7 @@ from flows.outcome import (
     failed_outcome,
 )
 from flows.pages import dataset_page
-from flows.parameters import Matrix, Sequences, Settings, StoreRoot
+from flows.parameters import DIFFERENT, Matrix, RunnerName, Sequences, Settings, StoreRoot
 from flows.preflight import preflight_cases
 from flows.run_page import run_page
 from flows.runners import PrefectRunner, refreshed_once
@@ -48,9 +50,6 @@ __all__ = ["reconstruct_dataset"]
 
 log = logging.getLogger(__name__)
 
-MAX_FAILED_SHARE = 0.5
-"""When most sequences fail, it is hardly the sequences' fault."""
-
 
 @flow(name="reconstruct-dataset", flow_run_name="{name}", log_prints=False, persist_result=False)
 def reconstruct_dataset(
@@ -65,7 +64,7 @@ def reconstruct_dataset(
     ] = None,
     refresh: Annotated[bool, Field(description="run every stage although its artefact is there")] = False,
     until: Annotated[StageName, Field(description="last stage to run")] = "report",
-    runner: Annotated[str, Field(description="threads, dask or dask:ADDRESS")] = "threads",
+    runner: Annotated[RunnerName, Field(description="threads, dask or dask:ADDRESS")] = "threads",
     at_once: Annotated[int, Field(ge=1, description="sequences in work at the same time")] = 1,
     name: Annotated[str, Field(description="name of this run, for its table")] = "dataset",
     method: Annotated[
@@ -79,10 +78,12 @@ def reconstruct_dataset(
         Only | None, Field(description="only those whose last run failed, that have changed, or never ended")
     ] = None,
     methods: Annotated[
-        list[MethodName] | None, Field(min_length=1, description="several methods instead of one")
+        list[MethodName] | None,
+        Field(min_length=1, description="several methods instead of one", json_schema_extra=DIFFERENT),
     ] = None,
     seeds: Annotated[
-        list[Seed] | None, Field(min_length=1, description="several seeds instead of one")
+        list[Seed] | None,
+        Field(min_length=1, description="several seeds instead of one", json_schema_extra=DIFFERENT),
     ] = None,
     matrix: Annotated[
         Matrix, Field(description='several values of settings, e.g. {"coarse.iterations": [500, 1000]}')
@@ -236,6 +237,8 @@ def outcome_of(sequence: str, state: State[Any]) -> SequenceOutcome:
     found = state.result(raise_on_failure=False)
     if isinstance(found, SequenceOutcome):
         return found
+    if isinstance(found, Exception):
+        release_locals(found)  # It is kept until the last sequence has ended.
     if isinstance(found, SequenceFailedError):
         return found.outcome
     # Not a stage but the run itself failed (a crash of its task runner, say).

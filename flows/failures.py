@@ -1,14 +1,20 @@
-"""Error messages of the command line for exceptions."""
+"""Exceptions: what the command line says of them, and the memory that they hold."""
 
 from __future__ import annotations
 
+import inspect
 import os
 import sys
 from collections.abc import Iterator
+from traceback import walk_tb
 
 from extrags.errors import ExtragsError
 
-__all__ = ["describe_error", "is_connection_error"]
+__all__ = ["describe_error", "is_connection_error", "release_locals"]
+
+SUSPENDED = inspect.CO_COROUTINE | inspect.CO_ASYNC_GENERATOR
+"""Kinds of functions that may have caught the exception and wait in an event loop for something else, as the
+clients of Prefect and Dask do: clearing their frames would end them. No stage is one."""
 
 SEE_TRACEBACK = "run again with --debug for the traceback"
 
@@ -53,6 +59,31 @@ def is_connection_error(error: BaseException) -> bool:
     ]
     loaded = [getattr(sys.modules[module], name) for module, name in kinds if module in sys.modules]
     return isinstance(error, (ConnectionError, *loaded))
+
+
+def release_locals(error: BaseException) -> None:
+    """Let go of the local variables in the tracebacks of an exception, its causes and contexts.
+
+    A traceback keeps all frames that the exception has left, with the images and mapped files in them, for
+    as long as the exception is kept. Files, line numbers and messages stay. Frames that still run keep
+    theirs.
+    """
+    found: dict[int, BaseException] = {}
+    waiting: list[BaseException | None] = [error]
+    while waiting:
+        item = waiting.pop()
+        if item is None or id(item) in found:
+            continue
+        found[id(item)] = item
+        waiting += [item.__cause__, item.__context__]
+    for item in found.values():
+        for frame, _ in walk_tb(item.__traceback__):
+            if frame.f_code.co_flags & SUSPENDED:
+                continue
+            try:
+                frame.clear()
+            except RuntimeError:  # It still runs.
+                continue
 
 
 def _server_hint() -> str:

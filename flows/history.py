@@ -37,6 +37,9 @@ __all__ = [
 FIGURES = ("observed.psnr", "psnr")
 """The figure a run is judged by is the first of these that it has."""
 
+READABLE_LETTERS = 190
+"""Letters of a benchmark's name in the names of its records: file systems allow 255 in all."""
+
 SAME_MACHINE = ("processor", "cores", "threads", "isa")
 """What must be equal for run times to be comparable; keys of `extrags.raster.bench.machine`."""
 
@@ -162,8 +165,9 @@ def history_of(store: Store, name: str) -> list[dict[str, Any]]:
 
 
 def _prefix(name: str) -> str:
-    # The digest, because several names may come to the same letters.
-    return f"benchmark.{re.sub(r'[^a-z0-9]+', '-', name.lower())}.{digest_of(name)[:8]}."
+    # The digest, because several names may come to the same letters, of which a file's name takes so many.
+    letters = re.sub(r"[^a-z0-9]+", "-", name.lower())[:READABLE_LETTERS]
+    return f"benchmark.{letters}.{digest_of(name)[:8]}."
 
 
 def judge(entry: Mapping[str, Any], earlier: Sequence[Mapping[str, Any]], tolerance: Tolerance) -> Judgement:

@@ -11,7 +11,9 @@ from extrags.stages import REGISTRY, Part
 from extrags.store import Ref
 
 __all__ = [
+    "MAX_FAILED_SHARE",
     "NOT_COUNTED",
+    "BenchmarkFailedError",
     "DatasetFailedError",
     "DatasetOutcome",
     "SequenceFailedError",
@@ -23,6 +25,9 @@ __all__ = [
 
 NOT_COUNTED = frozenset(stage.name for stage in REGISTRY if not stage.counted)
 """Stages that are not part of a method's run time."""
+
+MAX_FAILED_SHARE = 0.5
+"""When most sequences fail, it is hardly the sequences' fault."""
 
 StageState = Literal["ran", "cached", "skipped", "failed", "interrupted"]
 """How a stage ended. An interrupted one is announced, never returned: the run ends with it."""
@@ -41,7 +46,8 @@ class StageRow:
     made_seconds: float = 0.0
     """Time it took to compute its artefacts, in this or an earlier run."""
     spent_seconds: float = 0.0
-    """The part of `made_seconds` that was spent in this run; the rest is what cached artefacts once took."""
+    """The part of `made_seconds` that was spent in this run; the rest is what cached artefacts once took.
+    What was damaged and made again counts each time: then it may exceed `made_seconds`."""
     processor_seconds: float | None = None
     """Processor time of all threads while the artefacts were made, in this or an earlier run; None where an
     earlier version made one of them and did not measure it."""
@@ -197,3 +203,29 @@ class DatasetFailedError(ExtragsError, RuntimeError):
             f"{len(failed)} of {len(outcome.sequences)} sequences failed, more than the share of "
             f"{max_failed_share:g} that may (max_failed_share): {'; '.join(failed)}"
         )
+
+
+class BenchmarkFailedError(ExtragsError, RuntimeError):
+    """Too many runs of a benchmark failed.
+
+    Args:
+        name: of the benchmark.
+        result: what the flow would have returned; the `error` of its `cases` says why they failed.
+        max_failed_share: the share of its runs that might fail.
+    """
+
+    def __init__(self, name: str, result: dict[str, Any], max_failed_share: float) -> None:
+        self.result = result
+        failed = [_told(case) for case in result["cases"] if case["error"]]
+        super().__init__(
+            f"{len(failed)} of {len(result['cases'])} runs of the benchmark {name} failed, more than the "
+            f"share of {max_failed_share:g} that may (max_failed_share): {'; '.join(failed)}; "
+            f"page: {result['report']}"
+        )
+
+
+def _told(case: dict[str, Any]) -> str:
+    """A failed run of a benchmark, in words."""
+    setting = f"@{case['setting']}" if case["setting"] else ""
+    about = f"{case['method']}, {case['profile']}, seed {case['seed']}"
+    return f"{case['sequence']}{setting} [{about}] failed in {case['error']}"

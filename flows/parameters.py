@@ -12,7 +12,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from functools import cache
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 from pydantic import Field, GetJsonSchemaHandler, TypeAdapter
 from pydantic.json_schema import JsonSchemaValue
@@ -20,9 +20,12 @@ from pydantic_core import CoreSchema
 
 from extrags.config import PipelineConfig
 from extrags.config.settings import Setting, settings_of
+from flows.methods import MethodName
 
 __all__ = [
+    "DIFFERENT",
     "Matrix",
+    "RunnerName",
     "Sequences",
     "Settings",
     "StoreRoot",
@@ -32,6 +35,12 @@ __all__ = [
 
 ROOT_PATTERN = r"^(/|~|[A-Za-z][A-Za-z0-9+.-]*://)"
 """A store that is the same wherever a worker was started: an absolute path or a URL."""
+
+RUNNER_PATTERN = r"^(threads|dask(:.+)?)$"
+"""A task runner; whether the address is one is checked when the run begins."""
+
+DIFFERENT: dict[str, Any] = {"uniqueItems": True}
+"""In the schema of a list: what is given twice is refused, as a run with it would be."""
 
 
 @cache
@@ -120,19 +129,25 @@ class _SettingsSchema(_Shown):
 
 class _VariantsSchema(_Shown):
     def schema(self) -> JsonSchemaValue:
-        variant = settings_schema(further={"method": {"type": "string", "minLength": 1}})
+        variant = settings_schema(further={"method": {"enum": list(get_args(MethodName))}})
         return {"type": ["object", "null"], "additionalProperties": variant}
 
 
 class _MatrixSchema(_Shown):
     def schema(self) -> JsonSchemaValue:
-        lists = {name: {"type": "array", "minItems": 1, "items": value} for name, value in _values().items()}
+        several = {"type": "array", "minItems": 1, **DIFFERENT}
+        lists = {name: {**several, "items": value} for name, value in _values().items()}
         return {**settings_schema(lists), "type": ["object", "null"]}
 
 
 class _RootSchema(_Shown):
     def schema(self) -> JsonSchemaValue:
         return {"type": ["string", "null"], "minLength": 1, "pattern": ROOT_PATTERN}
+
+
+class _RunnerSchema(_Shown):
+    def schema(self) -> JsonSchemaValue:
+        return {"type": "string", "pattern": RUNNER_PATTERN}
 
 
 Settings = Annotated[dict[str, Any] | None, _SettingsSchema()]
@@ -146,6 +161,9 @@ Matrix = Annotated[dict[str, list[Any]] | None, _MatrixSchema()]
 
 StoreRoot = Annotated[str | None, _RootSchema()]
 """Directory or URL of a store; a deployment's must be absolute. None: see `flows.settings.run_store`."""
+
+RunnerName = Annotated[str, _RunnerSchema()]
+"""A task runner (`flows.settings.task_runner`)."""
 
 Sequences = list[Annotated[str, Field(min_length=1)]]
 """Names, paths, patterns over the catalogue's names, or `@FILE` for a manifest (`flows.selection`)."""

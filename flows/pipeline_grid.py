@@ -25,7 +25,7 @@ from extrags.output_files import write_file
 from extrags.store import digest_of
 from flows.budgets import Budget, reaching
 from flows.history import SAME_MACHINE
-from flows.outcome import NOT_COUNTED
+from flows.outcome import NOT_COUNTED, StageRow
 from flows.selection import Chosen
 
 if TYPE_CHECKING:
@@ -276,7 +276,7 @@ def run_cell(cell: Cell, store: str) -> dict[str, Any]:
         if None in processor
         else round(sum(value for value in processor if value is not None), 3),
         "peak_mib": max(peaks) if peaks else None,
-        "shared_seconds": round(sum(row.made_seconds - row.spent_seconds for row in counted), 3),
+        "shared_seconds": round(sum(map(_shared_seconds, counted)), 3),
         "load_average": round(os.getloadavg()[0], 2),
         "stages": [
             {
@@ -285,13 +285,18 @@ def run_cell(cell: Cell, store: str) -> dict[str, Any]:
                 "seconds": round(row.made_seconds, 3),
                 "processor_seconds": row.processor_seconds,
                 "peak_mib": row.peak_mib,
-                "shared_seconds": round(row.made_seconds - row.spent_seconds, 3),
+                "shared_seconds": round(_shared_seconds(row), 3),
             }
             for row in ran
         ],
         "metrics": outcome.metrics["final"] if failed is None else None,
         "error": "" if failed is None else f"{failed.stage}: {failed.reason}",
     }
+
+
+def _shared_seconds(row: StageRow) -> float:
+    # What was damaged and made twice in this run has spent more than it took to make.
+    return max(row.made_seconds - row.spent_seconds, 0.0)
 
 
 def _claim(folder: Path, about: dict[str, Any], separate: bool) -> None:

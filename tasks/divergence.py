@@ -13,7 +13,10 @@ __all__ = ["keep_last_finite_scene"]
 
 @contextmanager
 def keep_last_finite_scene(slot: Slot) -> Iterator[None]:
-    """On divergence, save the last finite scene with the debugging files of the failed stage."""
+    """On divergence, save the last finite scene with the debugging files of the failed stage.
+
+    The error is kept until the last sequence of a run has ended; the scene in it is not.
+    """
     try:
         yield
     except DivergedError as error:
@@ -21,4 +24,5 @@ def keep_last_finite_scene(slot: Slot) -> Iterator[None]:
 
         if isinstance(error.last_good, Scene):
             error.last_good.save(slot.debug / "last_good_scene")
+            error.last_good = None
         raise

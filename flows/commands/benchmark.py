@@ -108,6 +108,7 @@ def benchmark(given: argparse.Namespace) -> int:
     from flows.benchmark import check_methods, check_repetitions
     from flows.estimate import expected_seconds
     from flows.history import BenchmarkRegressedError
+    from flows.outcome import BenchmarkFailedError
     from flows.progress_display import RunInView, progress_display
     from flows.selection import absolute_manifests, chosen_sequences
     from flows.settings import task_runner
@@ -140,7 +141,7 @@ def benchmark(given: argparse.Namespace) -> int:
                 refresh=given.refresh,
                 tolerance=_tolerance(given),
             )
-        except BenchmarkRegressedError as error:
+        except (BenchmarkFailedError, BenchmarkRegressedError) as error:
             # Said to Prefect; here what was measured is told, and the exit code is 1.
             found = error.result
     print_benchmark(found, to_stderr=given.json == "-")

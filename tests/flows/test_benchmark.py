@@ -17,10 +17,12 @@ from extrags.metrics.registry import PROTOCOL_VERSION
 from extrags.store import Store
 from flows.benchmark import Case, benchmark, check_methods, run_method, summary_of
 from flows.commands.benchmark import print_benchmark
+from flows.history import Tolerance, history_of
 from flows.limits import StageLimits
-from flows.outcome import SequenceOutcome
+from flows.outcome import BenchmarkFailedError, SequenceOutcome
 from flows.runners import DirectRunner
 from flows.tables import difference_text, spread_text
+from tasks.run_page import artifact_key
 from tests.extrags.report.pages import Page
 from tests.flows.damaging import flip_bit
 from tests.flows.tiny import SEQUENCE, TINY
@@ -139,6 +141,37 @@ class TestAgain:
         assert fine["extrags"]["seconds"] > fine["coarse"]["seconds"] > 0
         assert "the folder is empty" in Path(found["report"]).read_text()
 
+    @pytest.mark.parametrize(("allowed", "fails"), [(None, True), (1.0, False)])
+    def test_one_whose_runs_all_failed_has_failed(
+        self, tmp_path: Path, allowed: float | None, fails: bool
+    ) -> None:
+        (tmp_path / "empty").mkdir()
+        # Names may be as long as one likes.
+        store, name = Store(tmp_path / "store"), f"none-{allowed}{' of many' * 30}"
+        state = benchmark(
+            sequences=[str(tmp_path / "empty")],
+            methods=["coarse", "3dgs"],
+            store=store.root,
+            name=name,
+            refresh=True,
+            tolerance=Tolerance(),
+            return_state=True,
+            **({} if allowed is None else {"max_failed_share": allowed}),
+        )
+        assert (state.is_failed(), state.is_completed()) == (fails, not fails)
+        # Page, table and history have been written all the same, and the state says what happened.
+        artifact: Any = Artifact.get(artifact_key("benchmark", name))
+        assert "the folder is empty" in artifact.data
+        assert [manifest.stage for manifest in store.ls()] == ["benchmark-report"]
+        (entry,) = history_of(store, name)
+        assert len(entry["cases"]) == 2
+        if fails:
+            assert f"2 of 2 runs of the benchmark {name} failed" in state.message
+            assert "[3dgs, quick, seed 0] failed in ingest: " in state.message
+            error = state.result(raise_on_failure=False)
+            assert isinstance(error, BenchmarkFailedError)
+            assert [case["metrics"] for case in error.result["cases"]] == [None, None]
+
     def test_what_its_page_finds_damaged_is_made_anew(
         self, finished: tuple[str, SequenceOutcome], tmp_path: Path
     ) -> None:
@@ -202,6 +235,7 @@ class TestAgain:
             store=finished[0],
             name="little memory",
             limits=StageLimits(memory_gb=0.001),
+            max_failed_share=1,
         )
         assert "more than the limit of 0.001 GB" in found["cases"][0]["error"]
 

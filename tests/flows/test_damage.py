@@ -6,7 +6,7 @@ import json
 import random
 import shutil
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -15,7 +15,7 @@ from extrags.errors import ArtefactGoneError, DamagedArtefactError
 from extrags.store import Ref, Store
 from flows.damage import again_after_damage
 from flows.outcome import SequenceOutcome
-from flows.runners import DirectRunner, PrefectRunner, StoreRunner
+from flows.runners import Call, DirectRunner, PrefectRunner, Result, StoreRunner
 from flows.wiring import run_sequence
 from tests.flows.damaging import chunks_of, delete, files_of, flip_bit, trials, truncate
 from tests.flows.tiny import SEQUENCE, TINY, tiny_config
@@ -77,6 +77,37 @@ def test_what_a_later_stage_finds_damaged_is_made_anew(
     assert outcome.metrics == whole.metrics
     assert f"stage ingest: artefact {key_of(whole, 'ingest')} is damaged ({RGB}: its content" in caplog.text
     assert list(records(store)) == [("ingest", RGB)]
+
+
+def test_what_was_spent_before_the_damage_was_met_counts(
+    finished: tuple[str, SequenceOutcome], store: Store
+) -> None:
+    _, whole = finished
+    for part in ("ingest", "coarse", "surface"):
+        store.rm(key_of(whole, part))
+    inner = DirectRunner(store.root)
+    spent: list[float] = []
+
+    class Damaging:
+        def run(self, calls: Sequence[Call], label: str) -> list[Result]:
+            results = inner.run(calls, label)
+            if calls[0].task.name == "coarse" and results[0].state == "ran":
+                spent.append(store.manifest(results[0].ref).elapsed_s)
+                if len(spent) == 1:
+                    flip_bit(min(Path(results[0].ref.uri).rglob("*.zip")), random.Random(0))
+            return results
+
+    outcome = run_sequence(SEQUENCE, tiny_config(), store.root, Damaging(), until="surface")
+    assert outcome.status == "ok", outcome.error
+    rows = {row.stage: row for row in outcome.stages}
+    assert len(spent) == 2
+    assert rows["coarse"].spent_seconds == pytest.approx(sum(spent))
+    assert rows["coarse"].made_seconds == pytest.approx(spent[1])
+    # Made before the damage was met, found in the store afterwards.
+    assert rows["ingest"].state == "ran"
+    assert rows["ingest"].spent_seconds > 0
+    assert rows["ingest"].spent_seconds == pytest.approx(rows["ingest"].made_seconds)
+    assert rows["assess"].spent_seconds == 0
 
 
 def test_what_the_wiring_itself_reads_is_made_anew(

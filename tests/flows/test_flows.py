@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import gc
 import threading
+import traceback
+import weakref
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
+import numpy as np
 import pytest
 import yaml
 from prefect.artifacts import Artifact
@@ -18,7 +22,7 @@ from prefect.task_runners import ThreadPoolTaskRunner
 import extrags.cores
 import flows.dataset
 import tasks.progress
-from extrags.errors import ArtefactGoneError, ConfigError, StoreError
+from extrags.errors import ArtefactGoneError, ConfigError, ExtragsError, StoreError
 from extrags.stages import STAGES
 from extrags.store import Store
 from flows.dataset import reconstruct_dataset
@@ -158,6 +162,40 @@ class TestDataset:
             failure = state.result(raise_on_failure=False)
             assert isinstance(failure, DatasetFailedError)
             assert [outcome.status for outcome in failure.outcome.sequences] == ["failed", "failed"]
+
+
+@pytest.mark.usefixtures("prefect_server")
+def test_what_a_failed_sequence_had_in_memory_is_gone_when_the_next_begins(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    held: list[weakref.ref[np.ndarray]] = []
+    in_memory: list[int] = []
+
+    def reconstruct(*_: object, **__: object) -> None:
+        gc.collect()
+        in_memory.append(sum(found() is not None for found in held))
+        large = np.zeros(1 << 20)
+        held.append(weakref.ref(large))
+        try:
+            raise ValueError(large.shape)
+        except ValueError as error:
+            raise ExtragsError("it diverged") from error
+
+    monkeypatch.setattr("extrags.training.reconstruct", reconstruct)
+    found = reconstruct_dataset(
+        sequences=[f"phantom/{number}@sparse" for number in range(3)],
+        profile="quick",
+        settings=TINY,
+        store=str(tmp_path),
+        until="coarse",
+        max_failed_share=1,
+    )
+    assert in_memory == [0, 0, 0]
+    # What `--debug` shows is there all the same.
+    for outcome in found.sequences:
+        shown = "".join(traceback.format_exception(outcome.error))
+        assert "raise ValueError(large.shape)" in shown
+        assert "ExtragsError: it diverged" in shown
 
 
 def test_an_interrupted_dataset_begins_no_more_sequences(

@@ -25,6 +25,7 @@ from flows.history import (
     judge,
     trend,
 )
+from flows.outcome import BenchmarkFailedError
 from flows.tables import judgement_markdown
 from tests.flows.tiny import SEQUENCE, TINY
 
@@ -203,6 +204,15 @@ class TestRecords:
         assert len(history_of(store, "weekly!")) == 1
         assert history_of(store, "week") == []
 
+    def test_names_of_any_length_are_told_apart(self, tmp_path: Path) -> None:
+        store = Store(tmp_path)
+        names = ["long " * 60, "long " * 60 + "!", "long " * 60 + "er"]
+        for name in names:
+            append_history(store, {**entry(), "name": name})
+        assert [[item["name"] for item in history_of(store, name)] for name in names] == [
+            [name] for name in names
+        ]
+
     def test_the_trend_has_what_can_be_compared(self) -> None:
         drawn = trend(
             [entry(psnr=19, day=1, machine={"cores": 64}), entry(psnr=None, day=2), entry(psnr=20, day=3)]
@@ -318,8 +328,13 @@ class TestFlow:
         assert again["cases"][0]["seconds"] == found[-1]["cases"][0]["seconds"]
         assert len(history_of(store, "weekly")) == 5
 
+    @pytest.mark.parametrize("failed", [False, True])
     def test_the_command_tells_what_was_measured_when_it_is_worse(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+        self,
+        tmp_path: Path,
+        monkeypatch: pytest.MonkeyPatch,
+        capsys: pytest.CaptureFixture[str],
+        failed: bool,
     ) -> None:
         found: dict[str, Any] = {
             "machine": {},
@@ -332,6 +347,8 @@ class TestFlow:
         def measured(**given: Any) -> dict[str, Any]:
             # What has no limit of its own is not judged.
             assert (given["tolerance"].psnr_db, given["tolerance"].seconds_share) == (None, 0.5)
+            if failed:
+                raise BenchmarkFailedError("weekly", found, 0.5)
             raise BenchmarkRegressedError("weekly", found)
 
         monkeypatch.setattr(

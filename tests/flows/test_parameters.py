@@ -123,9 +123,36 @@ class TestSchema:
             ("benchmark", {"seeds": [0, -1]}),
             ("benchmark", {"tolerance": {"psnr": 1}}),
             ("benchmark", {"tolerance": {"psnr_db": -1}}),
+            ("benchmark", {"variants": {"a": {"method": "nix"}}}),
+            ("benchmark", {"max_failed_share": 1.5}),
         ):
             with pytest.raises(RefusedError):
                 submitted(name, **wrong)
+
+    @pytest.mark.parametrize(
+        ("name", "wrong"),
+        [
+            ("dataset", {"seeds": [1, 1]}),
+            ("dataset", {"methods": ["3dgs", "3dgs"]}),
+            ("dataset", {"matrix": {"coarse.iterations": [5, 5]}}),
+            ("benchmark", {"seeds": [1, 1]}),
+            ("benchmark", {"methods": ["3dgs", "3dgs"]}),
+            ("benchmark", {"profiles": ["quick", "quick"]}),
+        ],
+    )
+    def test_what_is_given_twice(self, name: str, wrong: dict[str, Any]) -> None:
+        with pytest.raises(RefusedError, match="has non-unique elements"):
+            submitted(name, **wrong)
+
+    def test_none_is_no_list(self) -> None:
+        submitted("dataset", seeds=None, methods=None, matrix=None)
+
+    def test_runners(self) -> None:
+        for good in ("threads", "dask", "dask:tcp://127.0.0.1:8786"):
+            submitted("dataset", runner=good)
+        for wrong in ("thread", "threads:2", "dask:", "process", "", None):
+            with pytest.raises(RefusedError, match=r"\$\.runner: "):
+                submitted("dataset", runner=wrong)
 
 
 @pytest.mark.usefixtures("prefect_server")

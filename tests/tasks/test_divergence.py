@@ -22,7 +22,7 @@ def test_the_last_good_scene_is_kept_and_nothing_is_cached(tmp_path: Path) -> No
     )  # fmt: skip
     store = Store(str(tmp_path))
     with (
-        pytest.raises(DivergedError, match="iteration 7"),
+        pytest.raises(DivergedError, match="iteration 7") as caught,
         store.slot(stage="coarse", version=1, key="coarse-v1-test", label="", config={}, inputs={}) as slot,
         keep_last_finite_scene(slot),
     ):
@@ -31,3 +31,4 @@ def test_the_last_good_scene_is_kept_and_nothing_is_cached(tmp_path: Path) -> No
     kept = list(tmp_path.glob("failed/**/last_good_scene"))
     assert len(kept) == 1
     assert len(Scene.load(kept[0]).gaussians) == n
+    assert caught.value.last_good is None, "an outcome keeps the error for as long as its run"
