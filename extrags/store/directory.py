@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import fcntl
 import json
+import logging
 import os
 import secrets
 import shutil
@@ -28,6 +29,8 @@ __all__ = [
     "private_directory",
     "sweep_directories",
 ]
+
+log = logging.getLogger(__name__)
 
 DAMAGED = "damaged"
 """Where damaged artefacts are set aside, below the root of a store."""
@@ -273,12 +276,28 @@ class DirectoryBackend:
         return aside
 
     def sweep(self, older_than_hours: float, *, dry_run: bool = False) -> list[str]:
-        """Remove scratch directories of killed processes, and artefact directories without a manifest."""
+        """Remove scratch directories of killed processes, and artefact directories without a manifest.
+
+        Those that this user may not look into or remove, as those of another user, stay.
+        """
         removed = sweep_directories(self.scratch, dry_run=dry_run)
         for key in self.names():
-            if not (self.artefacts / key / MANIFEST).exists() and (dry_run or self.discard(key)):
-                removed.append(f"artefacts/{key}")
+            try:
+                if self._lacks_manifest(key) and (dry_run or self.discard(key)):
+                    removed.append(f"artefacts/{key}")
+            except StoreError as error:
+                log.debug("left in place: %s", error)
         return removed
+
+    def _lacks_manifest(self, key: str) -> bool:
+        path = self.artefacts / key / MANIFEST
+        try:
+            path.stat()
+        except (FileNotFoundError, NotADirectoryError):
+            return True
+        except OSError as error:
+            log.debug("%s cannot be looked at, and stays: %s", path, error.strerror)
+        return False
 
 
 @contextmanager
@@ -330,36 +349,30 @@ def _claim(parent: Path, name: str) -> tuple[Path, int]:
 def held_directories(parent: Path) -> list[Path]:
     """The directories below `parent` that a process has locked, i.e. works in, on this or another machine."""
     held = []
-    try:
-        entries = sorted(entry.path for entry in os.scandir(parent) if entry.is_dir(follow_symlinks=False))
-    except FileNotFoundError:
-        return []
-    for path in entries:
-        try:
-            lock = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
-        except FileNotFoundError:
+    for name in _directories(parent):
+        path = parent / name
+        lock = _opened(path)
+        if lock is None:
             continue
         try:
             # Shared: looking must not seem to another who looks to be work.
             fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
         except BlockingIOError:
-            held.append(Path(path))
+            held.append(path)
         finally:
             os.close(lock)
     return held
 
 
 def sweep_directories(parent: Path, *, dry_run: bool = False) -> list[str]:
-    """Remove the directories below `parent` that no process has locked; returns their names."""
+    """Remove the directories below `parent` that no process has locked; returns their names.
+
+    Those that this user may not look into or remove, as those of another user, stay.
+    """
     removed = []
-    try:
-        entries = sorted(entry.name for entry in os.scandir(parent) if entry.is_dir(follow_symlinks=False))
-    except FileNotFoundError:
-        return []
-    for name in entries:
-        try:
-            lock = os.open(parent / name, os.O_RDONLY | os.O_DIRECTORY)
-        except FileNotFoundError:
+    for name in _directories(parent):
+        lock = _opened(parent / name)
+        if lock is None:
             continue
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -368,7 +381,30 @@ def sweep_directories(parent: Path, *, dry_run: bool = False) -> list[str]:
         else:
             if not dry_run:
                 shutil.rmtree(parent / name, ignore_errors=True)
-            removed.append(f"{parent.name}/{name}")
+            if dry_run or not (parent / name).exists():
+                removed.append(f"{parent.name}/{name}")
         finally:
             os.close(lock)
     return removed
+
+
+def _directories(parent: Path) -> list[str]:
+    """Names of the directories below `parent`, sorted; none where it may not be listed."""
+    try:
+        return sorted(entry.name for entry in os.scandir(parent) if entry.is_dir(follow_symlinks=False))
+    except FileNotFoundError:
+        return []
+    except PermissionError as error:
+        log.debug("%s cannot be listed: %s", parent, error.strerror)
+        return []
+
+
+def _opened(directory: Path) -> int | None:
+    """Descriptor of a directory; None where it is gone, or may not be opened, as one of another user."""
+    try:
+        return os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
+    except FileNotFoundError:
+        return None
+    except PermissionError as error:
+        log.debug("%s cannot be opened, and stays: %s", directory, error.strerror)
+        return None

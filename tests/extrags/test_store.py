@@ -22,7 +22,9 @@ import extrags.store.directory
 from extrags.config import CoarseConfig, IngestConfig
 from extrags.errors import ConfigError, DamagedArtefactError, MissingDependencyError, StoreError
 from extrags.store import MANIFEST, Manifest, Ref, Store, canonical, content_digest, digest_of
+from extrags.store.directory import held_directories
 from extrags.store.integrity import Examinable
+from tests.other_user import give_to_another_user
 
 plain = st.recursive(
     st.none()
@@ -342,6 +344,47 @@ class TestDirectory:
             assert removed[0].startswith("scratch/toy-v1-aa.")
         assert [manifest.key for manifest in store.ls()] == ["toy-v1-bb"]
         assert list((tmp_path / "scratch").iterdir()) == []
+
+    def test_folders_of_another_user_stay_and_hinder_nothing(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        store = Store(tmp_path)
+        put(store)
+        private = [tmp_path / "artefacts" / "toy-v1-private", tmp_path / "scratch" / "toy-v1-private.01"]
+        free = [tmp_path / "artefacts" / "toy-v1-zz", tmp_path / "scratch" / "toy-v1-zz.01"]
+        for folder in [*private, *free]:
+            folder.mkdir()
+        give_to_another_user(monkeypatch, *private)
+        left = ["scratch/toy-v1-zz.01", "artefacts/toy-v1-zz"]
+        assert held_directories(store.backend.scratch) == []
+        assert store.gc(dry_run=True) == left
+        assert store.gc() == left
+        assert all(folder.exists() for folder in private)
+        assert store.sweep_scratch() == []
+
+    def test_what_may_not_be_removed_stays_and_hinders_nothing(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        store = Store(tmp_path)
+        for name in ("a", "b"):
+            (tmp_path / "artefacts" / f"toy-v1-{name}").mkdir(parents=True)
+        rename = Path.rename
+
+        def refused(path: Path, target: Path) -> Path:
+            if path.name == "toy-v1-a":
+                raise PermissionError(13, "Permission denied", str(path))
+            return rename(path, target)
+
+        monkeypatch.setattr(Path, "rename", refused)
+        assert store.sweep() == ["artefacts/toy-v1-b"]
+
+    def test_scratch_of_another_user_is_passed_over(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        store = Store(tmp_path)
+        (tmp_path / "scratch" / "toy-v1-a.01").mkdir(parents=True)
+        give_to_another_user(monkeypatch, tmp_path / "scratch")
+        assert (store.sweep(), held_directories(store.backend.scratch)) == ([], [])
 
     def test_what_is_removed_while_it_is_made_anew_is_there_whole(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
