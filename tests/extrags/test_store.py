@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import multiprocessing
 import os
 import signal
@@ -9,8 +11,9 @@ import stat
 import subprocess
 import sys
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -386,6 +389,111 @@ class TestDirectory:
         give_to_another_user(monkeypatch, tmp_path / "scratch")
         assert (store.sweep(), held_directories(store.backend.scratch)) == ([], [])
 
+    def test_work_of_another_machine_on_nfs_is_left_alone(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        _keep_locks_of_directories_local(monkeypatch)
+        store, other = Store(tmp_path), Store(tmp_path)
+        with store.slot(stage="toy", version=1, key="toy-v1-aa") as slot:
+            (slot.path / "half").write_text("x")
+            assert (other.gc(dry_run=True), other.sweep(), other.sweep_scratch()) == ([], [], [])
+            assert (slot.path / "half").read_text() == "x"
+            assert held_directories(other.backend.scratch) == [slot.path.parent]
+        assert sorted(path.name for path in store.open(slot.ref).iterdir()) == ["half", MANIFEST]
+        assert held_directories(other.backend.scratch) == list((tmp_path / "scratch").iterdir()) == []
+
+    def test_work_of_an_earlier_version_is_left_alone(self, tmp_path: Path) -> None:
+        store, folder = Store(tmp_path), tmp_path / "scratch" / "toy-v1-aa.01"
+        folder.mkdir(parents=True)
+        lock = os.open(folder, os.O_RDONLY)
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        assert (store.sweep(), held_directories(store.backend.scratch)) == ([], [folder])
+        assert list(folder.iterdir()) == []
+        os.close(lock)
+        assert store.gc(dry_run=True) == ["scratch/toy-v1-aa.01"]
+        assert list(folder.iterdir()) == []
+        assert store.sweep() == ["scratch/toy-v1-aa.01"]
+        assert not folder.exists()
+
+    @pytest.mark.parametrize("nfs", [False, True])
+    @pytest.mark.parametrize("moment", ["open directory", "open lock", "flock directory", "flock lock"])
+    def test_a_sweep_beside_the_beginning_of_work(
+        self, moment: str, nfs: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        if nfs:
+            _keep_locks_of_directories_local(monkeypatch)
+        store, swept = Store(tmp_path), []
+
+        def sweep_first(call: Callable[..., Any], name: str) -> Callable[..., Any]:
+            def swept_first(what: Any, *args: Any, **options: Any) -> Any:
+                path = what if isinstance(what, Path) else Path(os.readlink(f"/proc/self/fd/{what}"))
+                place = "lock" if path.name == "lock" else "directory"
+                if f"{name} {place}" == moment and tmp_path / "scratch" in path.parents and not swept:
+                    swept.append("begun")
+                    swept.extend(store.sweep_scratch())
+                return call(what, *args, **options)
+
+            return swept_first
+
+        opened = os.open
+        monkeypatch.setattr(
+            os,
+            "open",
+            lambda what, *args, **options: (
+                sweep_first(opened, "open") if isinstance(what, Path) else opened
+            )(what, *args, **options),
+        )
+        monkeypatch.setattr(fcntl, "flock", sweep_first(fcntl.flock, "flock"))
+        with store.slot(stage="toy", version=1, key="toy-v1-aa") as slot:
+            assert held_directories(store.backend.scratch) == [slot.path.parent]
+            assert store.sweep() == []
+            (slot.path / "file").write_text("x")
+        assert swept
+        assert store.find("toy-v1-aa") == slot.ref
+        assert list((tmp_path / "scratch").iterdir()) == []
+
+    def test_a_lock_that_nfs_keeps_while_it_is_open_goes_with_its_directory(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        remove, close = os.unlink, os.close
+        renamed: list[Path] = []
+
+        def kept(path: Any, *args: Any, **options: Any) -> None:
+            if os.fspath(path) == "lock":
+                folder = Path(os.readlink(f"/proc/self/fd/{options['dir_fd']}"))
+                renamed.append(folder / ".nfs01")
+                (folder / "lock").rename(renamed[-1])
+            else:
+                remove(path, *args, **options)
+
+        def closed(descriptor: int) -> None:
+            place = Path(os.readlink(f"/proc/self/fd/{descriptor}"))
+            close(descriptor)
+            if place in renamed and place.exists():
+                remove(place)
+
+        monkeypatch.setattr(os, "unlink", kept)
+        monkeypatch.setattr(os, "close", closed)
+        put(Store(tmp_path))
+        assert renamed
+        assert list((tmp_path / "scratch").iterdir()) == []
+
+    def test_no_room_for_a_lock_leaves_nothing(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        opened = os.open
+        (tmp_path / "scratch" / "toy-v1-aa.01.removed").mkdir(parents=True)
+
+        def full(path: Any, flags: int, *args: Any, **options: Any) -> int:
+            if flags & os.O_CREAT and os.path.basename(path) == "lock":
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+            return opened(path, flags, *args, **options)
+
+        monkeypatch.setattr(os, "open", full)
+        store = Store(tmp_path)
+        with pytest.raises(StoreError, match="No space left"):
+            put(store)
+        assert store.sweep() == ["scratch/toy-v1-aa.01.removed"]
+        assert list((tmp_path / "scratch").iterdir()) == []
+
     def test_what_is_removed_while_it_is_made_anew_is_there_whole(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
@@ -411,6 +519,17 @@ class TestDirectory:
         assert refs[0] == refs[1] == refs[2]
         assert len(Store(tmp_path).ls()) == 20
         assert list((tmp_path / "scratch").iterdir()) == []
+
+
+def _keep_locks_of_directories_local(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on an NFS client, which asks the server for locks of files alone: no machine sees the other's."""
+    lock = fcntl.flock
+
+    def local(descriptor: int, kind: int) -> None:
+        if not stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            lock(descriptor, kind)
+
+    monkeypatch.setattr(fcntl, "flock", local)
 
 
 def _put_many(root: str) -> list[Ref]:
