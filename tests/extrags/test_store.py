@@ -570,6 +570,43 @@ class TestUrl:
         assert sorted(store.sweep(older_than_hours=0.0)) == ["toy-v1-aa/loser", "toy-v1-bb/attempt"]
         assert store.verify(ref)
 
+    @pytest.mark.parametrize("scheme", ["memory", "local"])
+    @pytest.mark.parametrize("moment", ["find", "rm"])
+    def test_two_machines_sweep_at_once(
+        self, scheme: str, moment: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        place = uuid.uuid4().hex if scheme == "memory" else f"{tmp_path}/store"
+        store, other = (Store(f"{scheme}://{place}", cache=tmp_path / name) for name in ("here", "there"))
+        backend: Any = store.backend
+        ref = put(store)
+        for name in ("toy-v1-bb/one", "toy-v1-bb/two", "toy-v1-cc/one"):
+            backend.fs.makedirs(f"{backend.prefix}/{name}", exist_ok=True)
+            backend.fs.pipe_file(f"{backend.prefix}/{name}/half", b"x")
+        call, swept = getattr(backend.fs, moment), []
+
+        def other_first(*args: Any, **options: Any) -> Any:
+            listed = call(*args, **options) if moment == "find" else None
+            if not swept:
+                swept.append("begun")
+                swept.extend(other.sweep(older_than_hours=-0.1))
+            return listed if moment == "find" else call(*args, **options)
+
+        monkeypatch.setattr(backend.fs, moment, other_first)
+        assert store.sweep(older_than_hours=-0.1) == []
+        assert swept == ["begun", "toy-v1-bb/one", "toy-v1-bb/two", "toy-v1-cc/one"]
+        assert store.keys() == ["toy-v1-aa"]
+        assert store.verify(ref)
+
+    def test_an_empty_folder_is_as_old_as_it_is(self, tmp_path: Path) -> None:
+        store = Store(f"local://{tmp_path}/store", cache=tmp_path / "cache")
+        put(store)
+        begun, old = (tmp_path / "store" / "toy-v1-bb" / name for name in ("begun", "old"))
+        begun.mkdir(parents=True)
+        old.mkdir()
+        os.utime(old, (0, 0))
+        assert store.sweep() == ["toy-v1-bb/old"]
+        assert (begun.exists(), old.exists()) == (True, False)
+
     def test_local_copies_go_with_what_they_are_copies_of(self, tmp_path: Path) -> None:
         store = Store(f"memory://{uuid.uuid4().hex}", cache=tmp_path)
         removed, kept = store.open(put(store, "toy-v1-aa")), store.open(put(store, "toy-v1-ab"))
