@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from typing import Annotated
 
 from prefect import flow
@@ -124,12 +125,13 @@ def open_store(root: str) -> Store:
     store.check_writable()
     if is_inner_run():
         return store
-    for step in (
+    steps: tuple[Callable[[], list[str]], ...] = (
         store.sweep,
         lambda: sweep_locks(store.locks),
         lambda: file_killed(store),
         lambda: sweep_unreadable(store),
-    ):
+    )
+    for step in steps:
         try:
             for name in step():
                 log.info("removed what a killed run left: %s", name)
