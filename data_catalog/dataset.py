@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import os
-import time
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -12,18 +9,10 @@ from typing import Any, Protocol, runtime_checkable
 from pydantic import BaseModel, ConfigDict
 
 from extrags.config import IngestConfig
+from extrags.file_digests import size_and_digest
 from extrags.sequence import EndoscopicSequence
 
 __all__ = ["Dataset", "Descriptor", "Source", "file_digests"]
-
-_BLOCK_BYTES = 1 << 20
-_SETTLED_NS = 60_000_000_000
-"""A file that changed since then may change again without another time of change: clocks of file systems are
-coarse, and what is written through mapped memory is stamped late."""
-_MOST_REMEMBERED = 1 << 17
-
-_remembered: dict[tuple[int, ...], str] = {}
-"""Digests by what the operating system tells of a file."""
 
 
 class Descriptor(BaseModel):
@@ -132,32 +121,10 @@ class Dataset(Protocol):
 def file_digests(listed: Iterable[tuple[str, Path]]) -> list[list[Any]]:
     """Name, size in bytes and BLAKE2b digest of each file, as JSON gives them back.
 
-    Files that this process has digested, and that the operating system says are unchanged since, are not read
-    again: same inode, size, and times of the last change of content and of inode. Programs can set the first
-    of these times back, not the second.
+    Files that have not changed since this process digested them are not read again
+    (`extrags.file_digests.size_and_digest`).
 
     Args:
         listed: files, each with a name that does not depend on where it lies.
     """
-    return [[name, *_size_and_digest(file)] for name, file in listed]
-
-
-def _size_and_digest(file: Path) -> tuple[int, str]:
-    with file.open("rb") as stream:
-        # Of the open file, and before its content: a change while it is read leads to other times. Network
-        # file systems ask their server when a file is opened, not at every `stat`.
-        state = os.fstat(stream.fileno())
-        now_ns = time.time_ns()
-        known_by = (state.st_dev, state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns)
-        found = _remembered.get(known_by)
-        if found is None:
-            digest = hashlib.blake2b(digest_size=16)
-            while block := stream.read(_BLOCK_BYTES):
-                digest.update(block)
-            found = digest.hexdigest()
-            # File systems without times give 0.
-            if 0 < state.st_ctime_ns < now_ns - _SETTLED_NS:
-                if len(_remembered) >= _MOST_REMEMBERED:
-                    _remembered.clear()
-                _remembered[known_by] = found
-    return state.st_size, found
+    return [[name, *size_and_digest(file)] for name, file in listed]

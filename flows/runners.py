@@ -20,6 +20,7 @@ from prefect import Task
 from prefect.context import FlowRunContext
 from prefect.futures import PrefectFuture
 
+from data_catalog.names import path_of
 from extrags.errors import ExtragsError
 from extrags.store import Ref, Store
 from flows.limits import StageLimits
@@ -152,6 +153,7 @@ class PrefectRunner:
             future: PrefectFuture[Ref] = task.submit(
                 store=self.store,
                 label=label,
+                place=path_of(label) or "",
                 time_limit_s=self.limits.time_limit_s,
                 threads=threads,
                 **call.inputs,
@@ -215,7 +217,9 @@ class DirectRunner:
             found = None if self.refresh else store.find_or_set_aside(key)
             # What is there stays until the new one takes its place: making it may be interrupted, or fail.
             with refreshing() if self.refresh else nullcontext():
-                ref = found or call.task.fn(store=self.store, label=label, **call.inputs)
+                ref = found or call.task.fn(
+                    store=self.store, label=label, place=path_of(label) or "", **call.inputs
+                )
             results.append(Result(ref, "ran" if found is None else "cached"))
             _tell(calls, label, len(results))
         return results

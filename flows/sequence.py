@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from typing import Annotated
 
 from prefect import flow
@@ -115,7 +116,7 @@ def open_store(root: str) -> Store:
     """Open the store of a run, check that it can be written, and remove leftovers of killed runs.
 
     A run inside another one leaves them: that has just removed them, and on an object store it takes a
-    request for every artefact.
+    request for every artefact. What cannot be removed costs a warning.
 
     Raises:
         StoreError: when it cannot be written. Prefect itself would run everything and keep nothing.
@@ -124,6 +125,17 @@ def open_store(root: str) -> Store:
     store.check_writable()
     if is_inner_run():
         return store
-    for name in [*store.sweep(), *sweep_locks(store.locks), *file_killed(store), *sweep_unreadable(store)]:
-        log.info("removed what a killed run left: %s", name)
+    steps: tuple[Callable[[], list[str]], ...] = (
+        store.sweep,
+        lambda: sweep_locks(store.locks),
+        lambda: file_killed(store),
+        lambda: sweep_unreadable(store),
+    )
+    for step in steps:
+        try:
+            for name in step():
+                log.info("removed what a killed run left: %s", name)
+        except Exception as error:
+            # Leftovers take room and do no other harm. Each fsspec backend raises its own kinds.
+            log.warning("what killed runs left in %s could not all be removed: %s", root, error)
     return store

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import hashlib
-from functools import lru_cache
 from pathlib import Path
 
 from extrags.config import ImportedConfig
 from extrags.errors import ConfigError, SourceError, SourceNotFoundError
+from extrags.file_digests import size_and_digest
 from extrags.store import Ref, Slot
 from extrags.user_paths import expanded
 from tasks.coarse import HISTORY
@@ -28,15 +27,7 @@ def scene_digest(config: ImportedConfig) -> str:
     file = expanded(config.scene)
     if not file.is_file():
         raise SourceNotFoundError("no such file", file=file, field="imported.scene")
-    about = file.stat()
-    return _digest(file, about.st_size, about.st_mtime_ns)
-
-
-@lru_cache(maxsize=8)
-def _digest(file: Path, size: int, changed_ns: int) -> str:
-    """Size and time of change are for the cache."""
-    with file.open("rb") as opened:
-        return hashlib.file_digest(opened, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
+    return size_and_digest(file)[1]
 
 
 @stage("import-scene", version=1, ignore=("file",))

@@ -56,9 +56,9 @@ __all__ = [
 
 P = ParamSpec("P")
 
-NOT_IN_KEY = frozenset({"store", "label", "time_limit_s", "threads"})
-"""Parameters of every stage that do not affect the content of its artefact: store, display name, limit,
-threads."""
+NOT_IN_KEY = frozenset({"store", "label", "place", "time_limit_s", "threads"})
+"""Parameters of every stage that do not affect the content of its artefact: store, display name, where the
+sequence is, limit, threads."""
 
 DEVICE = "device"
 """Parameter of stages that may run on a GPU: cpu or cuda. Their results differ by rounding: it counts."""
@@ -147,10 +147,10 @@ def stage(
 
     Returns:
         A decorator. Its task takes the function's arguments by name, and in addition `store` (root of the
-        store), `label` (display name of the sequence), `time_limit_s` (see `tasks.progress.reporting`) and
-        `threads` (of the kernels, where other processes share the cores; all by default);
-        it returns a `Ref`. Arguments must be refs, settings or plain values, since their canonical form is
-        the key.
+        store), `label` (display name of the sequence), `place` (its absolute path, if it is one),
+        `time_limit_s` (see `tasks.progress.reporting`) and `threads` (of the kernels, where other processes
+        share the cores; all by default); it returns a `Ref`. Arguments must be refs, settings or plain
+        values, since their canonical form is the key.
 
     Raises:
         ConfigError: when two stages share a name.
@@ -167,6 +167,7 @@ def stage(
             *,
             store: str,
             label: str = "",
+            place: str = "",
             time_limit_s: float | None = None,
             threads: int | None = None,
             **inputs: Any,
@@ -179,7 +180,7 @@ def stage(
             found = where.find_or_set_aside(key)
             if found is not None and not _refreshing():
                 return found
-            return _made(body, key_of, key, inputs, where, label, time_limit_s, threads)
+            return _made(body, key_of, key, inputs, where, label, place, time_limit_s, threads)
 
         run.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
             [*signature.parameters.values(), *_PARAMETERS_OF_ALL], return_annotation=Ref
@@ -203,6 +204,7 @@ _PARAMETERS_OF_ALL = tuple(
     for name, annotation, default in (
         ("store", str, inspect.Parameter.empty),
         ("label", str, ""),
+        ("place", str, ""),
         ("time_limit_s", float | None, None),
         ("threads", int | None, None),
     )
@@ -223,6 +225,7 @@ def _made(
     inputs: dict[str, Any],
     where: Store,
     label: str,
+    place: str,
     time_limit_s: float | None,
     threads: int | None,
 ) -> Ref:
@@ -243,6 +246,7 @@ def _made(
             version=key_of.version,
             key=key,
             label=label,
+            place=place,
             config=settings,
             inputs=refs,
             renew=_refreshing(),

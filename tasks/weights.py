@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
-from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,6 +10,7 @@ from pydantic import BaseModel, ConfigDict
 
 from extrags.config import DepthConfig, EnhanceConfig, EvaluateConfig, LpipsNet
 from extrags.errors import WeightsError
+from extrags.file_digests import size_and_digest
 
 if TYPE_CHECKING:
     from extrags.confidence import PerceptualDifference
@@ -55,7 +54,7 @@ class Weights(BaseModel):
         if not self.paths:
             return None
         files = tuple(map(Path, self.paths))
-        if not all(file.is_file() for file in files) or _content_digest(files) != self.digest:
+        if not all(file.is_file() for file in files) or size_and_digest(*files)[1] != self.digest:
             raise WeightsError(
                 f"the weights of LPIPS with {self.net} in {', '.join(self.paths)} are not those this run "
                 "began with: they changed meanwhile, or this worker sees other files; run again"
@@ -80,27 +79,13 @@ def lpips_weights(config: EvaluateConfig) -> list[Weights]:
                 raise
             found.append(Weights(net=net, reason=str(error)))
             continue
-        found.append(Weights(net=net, paths=tuple(map(str, files)), digest=_content_digest(files)))
+        found.append(Weights(net=net, paths=tuple(map(str, files)), digest=size_and_digest(*files)[1]))
     return found
 
 
 def lpips_by_net(weights: Sequence[Weights]) -> dict[LpipsNet, Lpips | str]:
     """LPIPS by backbone: the metric with its weights, or the reason why there are none."""
     return {item.net: item.lpips() or item.reason for item in weights}
-
-
-def _content_digest(files: Sequence[Path]) -> str:
-    return _digest(tuple((file, file.stat().st_size, file.stat().st_mtime_ns) for file in files))
-
-
-@lru_cache(maxsize=8)
-def _digest(files: tuple[tuple[Path, int, int], ...]) -> str:
-    """Digest of the content of files, one after the other; sizes and times of change are for the cache."""
-    digest = hashlib.blake2b(digest_size=16)
-    for file, _, _ in files:
-        with file.open("rb") as opened:
-            hashlib.file_digest(opened, lambda: digest)
-    return digest.hexdigest()
 
 
 def restorer_digest(config: EnhanceConfig) -> str | None:

@@ -323,6 +323,7 @@ class Store:
         version: int,
         key: str,
         label: str = "",
+        place: str = "",
         config: Mapping[str, Any] | None = None,
         inputs: Mapping[str, Ref] | None = None,
         renew: bool = False,
@@ -334,6 +335,7 @@ class Store:
             version: version of the stage, raised by hand.
             key: the cache key; also the artefact's name.
             label: display name, e.g. of the sequence.
+            place: absolute path of a sequence that is one.
             config: settings, as JSON types.
             inputs: the input artefacts by name.
             renew: where the same content is there already, its manifest says from now on when and how fast
@@ -370,6 +372,7 @@ class Store:
                         key=key,
                         digest=listing.digest,
                         label=without_credentials(label),
+                        place="" if place == label else without_credentials(place),
                         config=without_credentials_in(dict(config or {})),
                         inputs={name: ref.digest for name, ref in (inputs or {}).items()},
                         input_keys={name: _key_of(ref) for name, ref in (inputs or {}).items()},
@@ -412,7 +415,7 @@ class Store:
             log.warning("could not keep the debugging files of %s: %s", key, problem)
 
     def ls(self, pattern: str = "*") -> list[Manifest]:
-        """Manifests of the artefacts whose key, stage or label matches a shell pattern, by age.
+        """Manifests of the artefacts whose key, stage, label or place matches a shell pattern, by age.
 
         Those whose manifest is damaged, or not for this user, are left out, with a warning.
 
@@ -420,7 +423,7 @@ class Store:
             StoreError: as `manifests`.
         """
         found, _ = self.manifests()
-        return [item for item in found if _matches(pattern, item.key, item.stage, item.label)]
+        return [item for item in found if _matches(pattern, item.key, *_about(item))]
 
     def manifests(self) -> tuple[list[Manifest], list[str]]:
         """Manifests of all artefacts, and keys of those whose manifest cannot be read, with a warning each.
@@ -445,16 +448,24 @@ class Store:
                 found += [] if manifest is None else [manifest]
         return sorted(found, key=lambda manifest: (manifest.started, manifest.key)), unreadable
 
-    def rm(self, pattern: str) -> list[str]:
-        """Remove artefacts by a shell pattern over key, stage or label; returns their keys.
+    def rm(self, pattern: str, *, here: str | None = None) -> list[str]:
+        """Remove artefacts by a shell pattern over key, stage, label or place; returns their keys.
+
+        A relative path may be the name of several sequences: where it is the pattern, those in one place go.
 
         Of those with a damaged manifest the label is not known; they go by key or stage. Those whose manifest
         this user may not read may be whole: they go by their own key alone, or are left, with a warning.
 
+        Args:
+            pattern: of the names.
+            here: absolute path that the pattern names for who gives it; None for none.
+
         Raises:
-            StoreError: as `manifests`, and when one cannot be removed.
+            StoreError: as `manifests`, when one cannot be removed, and when the pattern names sequences in
+                several places, or in another one than here.
         """
         chosen = []
+        named: dict[str, list[str]] = {}
         for key in self.backend.names():
             try:
                 manifest = self.backend.read_manifest(key)
@@ -468,10 +479,13 @@ class Store:
             else:
                 if manifest is None:
                     continue
-                about, started = [manifest.stage, manifest.label], manifest.started
+                about, started = _about(manifest), manifest.started
+                if pattern == manifest.label and pattern not in (key, manifest.stage):
+                    named.setdefault(manifest.place, []).append(key)
             if _matches(pattern, key, *about):
                 chosen.append((started, key))
-        return [key for _, key in sorted(chosen) if self.backend.discard(key)]
+        spared = _of_other_places(pattern, named, here)
+        return [key for _, key in sorted(chosen) if key not in spared and self.backend.discard(key)]
 
     def sweep_scratch(self) -> list[str]:
         """Remove scratch directories of killed processes of this machine alone; as `sweep`, but at once."""
@@ -541,6 +555,42 @@ def _as_damage(error: StoreError, key: str, root: str) -> DamagedArtefactError:
 def _matches(pattern: str, *names: str) -> bool:
     """Whether one of the names is meant, exactly or by a shell pattern: a folder's may have brackets."""
     return any(name == pattern or fnmatchcase(name, pattern) for name in names)
+
+
+def _about(manifest: Manifest) -> list[str]:
+    """What an artefact is found by, beside its key."""
+    return [manifest.stage, manifest.label, *([manifest.place] if manifest.place else [])]
+
+
+def _of_other_places(name: str, named: Mapping[str, list[str]], here: str | None) -> set[str]:
+    """Keys of artefacts of that name that are not of the sequence which is meant.
+
+    Args:
+        name: a relative path.
+        named: keys by place; empty where it is not known.
+        here: which place is meant; None where that is not known.
+
+    Raises:
+        StoreError: when none of the places is meant, or it is not known which.
+    """
+    places = sorted(place for place in named if place)
+    if here in places:
+        # Of a single known place are also those from before there were places.
+        others = set(places) - {here} | ({""} if len(places) > 1 else set())
+        spared = {key for place in others for key in named.get(place, [])}
+        if spared:
+            log.warning(
+                "%s: artefacts of that name in other places, or in one that is not known, are left: %d",
+                name,
+                len(spared),
+            )
+        return spared
+    if len(places) > 1 or (places and here is not None):
+        said = f", not {here}" if here is not None else ""
+        raise StoreError(
+            f"{name} is in this store the name of {' and '.join(places)}{said}; name one of these by its path"
+        )
+    return set()
 
 
 def _key_of(ref: Ref) -> str:

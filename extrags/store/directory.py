@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import fcntl
 import json
+import logging
 import os
 import secrets
 import shutil
@@ -29,6 +30,8 @@ __all__ = [
     "sweep_directories",
 ]
 
+log = logging.getLogger(__name__)
+
 DAMAGED = "damaged"
 """Where damaged artefacts are set aside, below the root of a store."""
 RECORD = "damage.json"
@@ -37,13 +40,19 @@ RECORDS = "records"
 """Where records of runs are, below the root of a store (`extrags.store.records`)."""
 ABOUT = "about.json"
 """In a scratch directory: what is being made there."""
+LOCK = "lock"
+"""In a scratch directory: an empty file that its writer holds locked, as it holds the directory. NFS tells
+other machines of locks on files, never of those on directories; earlier versions know the latter alone."""
+_REMOVED = ".removed"
+"""Ending of a directory in `scratch/` that is only there to be deleted, by whoever comes first."""
 
 
 class DirectoryBackend:
     """Artefacts in `artefacts/<key>/` below a root directory; unfinished ones are in `scratch/`.
 
-    A scratch directory is committed with one atomic `rename`. Its writer holds a `flock` on it, which the
-    kernel releases when the process ends for any reason; `sweep` removes the unlocked scratch directories.
+    What a scratch directory holds is committed with one atomic `rename`. Its writer holds a `flock` on it and
+    on a file in it, which the kernel releases when the process ends for any reason; `sweep` removes the
+    unlocked scratch directories.
     """
 
     def __init__(self, root: Path) -> None:
@@ -260,7 +269,7 @@ class DirectoryBackend:
 
     def _move_aside(self, key: str) -> Path | None:
         """Rename an artefact to a name in `scratch/`, which is returned; None where there is none."""
-        aside = self.scratch / f"{key}.{secrets.token_hex(4)}.removed"
+        aside = self.scratch / f"{key}.{secrets.token_hex(4)}{_REMOVED}"
         try:
             self.scratch.mkdir(parents=True, exist_ok=True)
             (self.artefacts / key).rename(aside)
@@ -273,12 +282,28 @@ class DirectoryBackend:
         return aside
 
     def sweep(self, older_than_hours: float, *, dry_run: bool = False) -> list[str]:
-        """Remove scratch directories of killed processes, and artefact directories without a manifest."""
+        """Remove scratch directories of killed processes, and artefact directories without a manifest.
+
+        Those that this user may not look into or remove, as those of another user, stay.
+        """
         removed = sweep_directories(self.scratch, dry_run=dry_run)
         for key in self.names():
-            if not (self.artefacts / key / MANIFEST).exists() and (dry_run or self.discard(key)):
-                removed.append(f"artefacts/{key}")
+            try:
+                if self._lacks_manifest(key) and (dry_run or self.discard(key)):
+                    removed.append(f"artefacts/{key}")
+            except StoreError as error:
+                log.debug("left in place: %s", error)
         return removed
+
+    def _lacks_manifest(self, key: str) -> bool:
+        path = self.artefacts / key / MANIFEST
+        try:
+            path.stat()
+        except (FileNotFoundError, NotADirectoryError):
+            return True
+        except OSError as error:
+            log.debug("%s cannot be looked at, and stays: %s", path, error.strerror)
+        return False
 
 
 @contextmanager
@@ -294,7 +319,7 @@ def private_directory(parent: Path, name: str, stage: str = "") -> Iterator[Path
         StoreError: when it cannot be created.
     """
     try:
-        path, lock = _claim(parent, name)
+        path, locks = _claim(parent, name)
     except OSError as error:
         reason = error.strerror or error
         if not stage:
@@ -305,70 +330,124 @@ def private_directory(parent: Path, name: str, stage: str = "") -> Iterator[Path
     try:
         yield path
     finally:
-        shutil.rmtree(path, ignore_errors=True)
-        os.close(lock)
+        _remove(path, locks)
 
 
-def _claim(parent: Path, name: str) -> tuple[Path, int]:
+def _claim(parent: Path, name: str) -> tuple[Path, list[int]]:
     parent.mkdir(parents=True, exist_ok=True)
     while True:
         path = parent / f"{name}.{secrets.token_hex(4)}"
         path.mkdir()
         try:
-            lock = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
-        except FileNotFoundError:
-            continue  # Another process's sweep removed it before it was locked.
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if os.path.samestat(os.fstat(lock), os.stat(path)):
-                return path, lock
+            return path, _lock(path, fcntl.LOCK_EX, create=True)
         except (BlockingIOError, FileNotFoundError):
-            pass  # Removed by a sweep after it was opened.
+            # Another process's sweep removes it, or somebody looks at it just now.
+            shutil.rmtree(path, ignore_errors=True)
+        except OSError:
+            shutil.rmtree(path, ignore_errors=True)
+            raise
+
+
+def _lock(directory: Path, kind: int, *, create: bool) -> list[int]:
+    """Lock a scratch directory and the file in it; descriptors that hold the locks until they are closed.
+
+    Args:
+        directory: which.
+        kind: `fcntl.LOCK_EX` to own it, `fcntl.LOCK_SH` to look.
+        create: whether to make a file that is not there; otherwise the directory alone is locked then.
+
+    Raises:
+        BlockingIOError: when another process holds one of them.
+        FileNotFoundError: when another process has removed one of them.
+        OSError: when one may not be opened or made.
+    """
+    taken: list[int] = []
+
+    def take(place: Path, flags: int) -> None:
+        taken.append(os.open(place, flags | os.O_NOFOLLOW, 0o666))
+        fcntl.flock(taken[-1], kind | fcntl.LOCK_NB)
+        # Who had it may have removed it between our open and our lock.
+        if not os.path.samestat(os.fstat(taken[-1]), os.stat(place)):
+            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(place))
+
+    try:
+        take(directory, os.O_RDONLY | os.O_DIRECTORY)
+        # For an exclusive lock NFS wants a file that is open for writing.
+        access = os.O_RDWR if kind == fcntl.LOCK_EX else os.O_RDONLY
+        if create or (directory / LOCK).exists():
+            take(directory / LOCK, access | (os.O_CREAT if create else 0))
+    except BaseException:
+        for lock in taken:
+            os.close(lock)
+        raise
+    return taken
+
+
+def _remove(directory: Path, locks: Iterable[int]) -> None:
+    """Remove a scratch directory, then give its locks back."""
+    shutil.rmtree(directory, ignore_errors=True)
+    for lock in locks:
         os.close(lock)
+    # On NFS a file that is removed while it is open stays, under another name, until it is closed.
+    with suppress(OSError):
+        directory.rmdir()
 
 
 def held_directories(parent: Path) -> list[Path]:
     """The directories below `parent` that a process has locked, i.e. works in, on this or another machine."""
     held = []
-    try:
-        entries = sorted(entry.path for entry in os.scandir(parent) if entry.is_dir(follow_symlinks=False))
-    except FileNotFoundError:
-        return []
-    for path in entries:
-        try:
-            lock = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
-        except FileNotFoundError:
-            continue
+    for name in _directories(parent):
         try:
             # Shared: looking must not seem to another who looks to be work.
-            fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            locks = _lock(parent / name, fcntl.LOCK_SH, create=False)
         except BlockingIOError:
-            held.append(Path(path))
-        finally:
-            os.close(lock)
+            held.append(parent / name)
+        except OSError as error:
+            _say_left(parent / name, error)
+        else:
+            for lock in locks:
+                os.close(lock)
     return held
 
 
 def sweep_directories(parent: Path, *, dry_run: bool = False) -> list[str]:
-    """Remove the directories below `parent` that no process has locked; returns their names."""
+    """Remove the directories below `parent` that no process has locked; returns their names.
+
+    Those that this user may not look into or remove, as those of another user, stay.
+    """
     removed = []
+    for name in _directories(parent):
+        path = parent / name
+        try:
+            # Without a file its writer may be about to make one: then who locks it first has the directory.
+            # In those that are to be deleted nobody works, and a full disk may have no room for a file.
+            locks = _lock(path, fcntl.LOCK_EX, create=not dry_run and not name.endswith(_REMOVED))
+        except BlockingIOError:
+            continue
+        except OSError as error:
+            _say_left(path, error)
+            continue
+        if dry_run:
+            for lock in locks:
+                os.close(lock)
+        else:
+            _remove(path, locks)
+        if dry_run or not path.exists():
+            removed.append(f"{parent.name}/{name}")
+    return removed
+
+
+def _directories(parent: Path) -> list[str]:
+    """Names of the directories below `parent`, sorted; none where it may not be listed."""
     try:
-        entries = sorted(entry.name for entry in os.scandir(parent) if entry.is_dir(follow_symlinks=False))
+        return sorted(entry.name for entry in os.scandir(parent) if entry.is_dir(follow_symlinks=False))
     except FileNotFoundError:
         return []
-    for name in entries:
-        try:
-            lock = os.open(parent / name, os.O_RDONLY | os.O_DIRECTORY)
-        except FileNotFoundError:
-            continue
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            pass
-        else:
-            if not dry_run:
-                shutil.rmtree(parent / name, ignore_errors=True)
-            removed.append(f"{parent.name}/{name}")
-        finally:
-            os.close(lock)
-    return removed
+    except PermissionError as error:
+        log.debug("%s cannot be listed: %s", parent, error.strerror)
+        return []
+
+
+def _say_left(directory: Path, error: OSError) -> None:
+    if not isinstance(error, FileNotFoundError):
+        log.debug("%s cannot be looked at, and stays: %s", directory, error.strerror)

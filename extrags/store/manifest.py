@@ -43,6 +43,9 @@ class Manifest(BaseModel):
     """Digest over the files (relative names and bytes), without this manifest and the list of checksums."""
     label: str = ""
     """Display name: the sequence it was made for. Not part of the key."""
+    place: str = ""
+    """Absolute path of a sequence that `label` names by a relative one, where it was made; empty for others,
+    and in manifests of earlier versions. Not part of the key."""
     config: dict[str, Any] = Field(default_factory=dict)
     """The stage's settings and other plain inputs."""
     inputs: dict[str, str] = Field(default_factory=dict)

@@ -91,6 +91,6 @@ def in_work(store: Store) -> list[dict[str, str]]:
     for directory in held_directories(store.backend.scratch):
         try:
             found.append(json.loads((directory / ABOUT).read_bytes()))
-        except (FileNotFoundError, ValueError):
-            continue  # No artefact, or only just begun or ended.
+        except (OSError, ValueError):
+            continue  # No artefact, only just begun or ended, or not for this user to read.
     return found

@@ -91,7 +91,7 @@ class SequenceUsage:
     """What the artefacts of a sequence use; those of several sequences count where they were first made.
 
     Args:
-        sequence: its display name.
+        sequence: its display name; its path where several in other places have this name.
         artefacts: number.
         files: number, manifests among them.
         bytes: of all files but manifests.
@@ -254,8 +254,12 @@ def usage(store: Store) -> list[SequenceUsage]:
     """What each sequence uses, the largest first."""
     contents = _Contents(store, runs_of(store))
     by_sequence: dict[str, list[Manifest]] = defaultdict(list)
+    places: dict[str, set[str]] = defaultdict(set)
     for item in contents.manifests.values():
-        by_sequence[item.label].append(item)
+        places[item.label] |= {item.place} - {""}
+    for item in contents.manifests.values():
+        # Earlier versions did not say where.
+        by_sequence[(len(places[item.label]) > 1 and item.place) or item.label].append(item)
     rows = [
         SequenceUsage(
             label,
@@ -285,7 +289,13 @@ def _with_pages(runs: list[Run], contents: _Contents) -> list[Run]:
     """Runs with records, and, for those from before there were records, their pages."""
     recorded = {key for run in runs for key in run.keys}
     pages = [
-        Run("", item.label, _date(contents.used[key]), frozenset(contents.with_inputs([key])))
+        Run(
+            "",
+            item.label,
+            _date(contents.used[key]),
+            frozenset(contents.with_inputs([key])),
+            place=item.place,
+        )
         for key, item in contents.manifests.items()
         if item.stage in FINAL_STAGES and key not in recorded
     ]

@@ -12,7 +12,7 @@ import json
 import os
 import secrets
 import shutil
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
@@ -238,7 +238,7 @@ class UrlBackend:
         place = f"{self.prefix}/{DAMAGED}"
         names = sorted(name for name, _ in self._children(place))
         if names and not dry_run:
-            self.fs.rm(place, recursive=True)
+            self._remove_all(place)
         return [f"{DAMAGED}/{name}" for name in names]
 
     def _copy_of(self, manifest: Manifest) -> Path:
@@ -383,6 +383,9 @@ class UrlBackend:
         for inner, kind in self._children(place):
             if kind == "directory":
                 self._remove_empty(f"{place}/{inner}")
+        self._remove_if_empty(place)
+
+    def _remove_if_empty(self, place: str) -> None:
         if not self._children(place):
             with suppress(OSError):
                 self.fs.rmdir(place)
@@ -410,11 +413,15 @@ class UrlBackend:
                 if kind != "directory" or (manifest is not None and attempt == manifest.data):
                     continue
                 place = f"{self.prefix}/{key}/{attempt}"
-                if all(self._modified(name) <= limit for name in self.fs.find(place)):
-                    if not dry_run:
-                        self.fs.rm(place, recursive=True)
-                        self._remove_empty(f"{self.prefix}/{key}")
+                modified = self._modified(place)
+                # Nothing there: another machine has removed it, or is about to write the first file.
+                if modified is None or modified > limit:
+                    continue
+                if dry_run or self._remove_all(place):
                     removed.append(f"{key}/{attempt}")
+                if not dry_run:
+                    self._remove_empty(place)
+                    self._remove_if_empty(f"{self.prefix}/{key}")
         for name, key in copies:
             if name not in stored and key not in unreadable and (dry_run or self._drop_unless_refused(name)):
                 removed.append(f"{self.local.name}/{name}")
@@ -429,6 +436,39 @@ class UrlBackend:
             return []
         return [(str(entry["name"]).rstrip("/").rsplit("/", 1)[-1], str(entry["type"])) for entry in entries]
 
-    def _modified(self, name: str) -> datetime.datetime:
-        moment: datetime.datetime = self.fs.modified(name)
-        return moment if moment.tzinfo else moment.replace(tzinfo=datetime.UTC)
+    def _remove_all(self, place: str) -> bool:
+        """Remove all that is below a place; False where another process has removed some of it meanwhile."""
+        try:
+            self.fs.rm(place, recursive=True)
+        except (FileNotFoundError, IsADirectoryError):  # The second is how s3fs says the first.
+            return False
+        return True
+
+    def _modified(self, place: str) -> datetime.datetime | None:
+        """When something below a place was changed last; None where nothing is there, or its time not known.
+
+        An empty folder, which object stores have none of, has a time of its own.
+        """
+        self.fs.invalidate_cache(place)
+        # With the listing, because what is asked for file by file may be gone by then.
+        found = list(self.fs.find(place, detail=True).values())
+        if not found:
+            with suppress(FileNotFoundError):
+                found = [self.fs.info(place)]
+        moments = [_time_of(about) for about in found]
+        known = [moment for moment in moments if moment is not None]
+        return max(known) if moments and len(known) == len(moments) else None
+
+
+def _time_of(about: Mapping[str, Any]) -> datetime.datetime | None:
+    """When a file was changed last, as backends of fsspec tell in their listings; None where they do not."""
+    for name in ("LastModified", "mtime", "last_modified", "modified", "updated", "created"):
+        told = about.get(name)
+        if isinstance(told, str):
+            with suppress(ValueError):
+                told = datetime.datetime.fromisoformat(told)
+        if isinstance(told, int | float):
+            told = datetime.datetime.fromtimestamp(told, datetime.UTC)
+        if isinstance(told, datetime.datetime):
+            return told if told.tzinfo else told.replace(tzinfo=datetime.UTC)
+    return None

@@ -228,11 +228,17 @@ def rm(given: argparse.Namespace) -> int:
     """`extrags cache rm`.
 
     Raises:
-        StoreError: when there is no such store, or nothing in it matches.
+        StoreError: when there is no such store, nothing in it matches, or a relative path is the name of
+            sequences in other places.
     """
+    from data_catalog.names import path_of
+
     store = _looked_into(given)
     removed = [
-        key for given_as in given.patterns for pattern in _spellings(given_as) for key in store.rm(pattern)
+        key
+        for given_as in given.patterns
+        for pattern in _spellings(given_as)
+        for key in store.rm(pattern, here=path_of(pattern))
     ]
     if not removed:
         raise StoreError(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import multiprocessing
 import os
 import signal
@@ -9,8 +11,9 @@ import stat
 import subprocess
 import sys
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +25,9 @@ import extrags.store.directory
 from extrags.config import CoarseConfig, IngestConfig
 from extrags.errors import ConfigError, DamagedArtefactError, MissingDependencyError, StoreError
 from extrags.store import MANIFEST, Manifest, Ref, Store, canonical, content_digest, digest_of
+from extrags.store.directory import held_directories
 from extrags.store.integrity import Examinable
+from tests.other_user import give_to_another_user
 
 plain = st.recursive(
     st.none()
@@ -343,6 +348,152 @@ class TestDirectory:
         assert [manifest.key for manifest in store.ls()] == ["toy-v1-bb"]
         assert list((tmp_path / "scratch").iterdir()) == []
 
+    def test_folders_of_another_user_stay_and_hinder_nothing(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        store = Store(tmp_path)
+        put(store)
+        private = [tmp_path / "artefacts" / "toy-v1-private", tmp_path / "scratch" / "toy-v1-private.01"]
+        free = [tmp_path / "artefacts" / "toy-v1-zz", tmp_path / "scratch" / "toy-v1-zz.01"]
+        for folder in [*private, *free]:
+            folder.mkdir()
+        give_to_another_user(monkeypatch, *private)
+        left = ["scratch/toy-v1-zz.01", "artefacts/toy-v1-zz"]
+        assert held_directories(store.backend.scratch) == []
+        assert store.gc(dry_run=True) == left
+        assert store.gc() == left
+        assert all(folder.exists() for folder in private)
+        assert store.sweep_scratch() == []
+
+    def test_what_may_not_be_removed_stays_and_hinders_nothing(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        store = Store(tmp_path)
+        for name in ("a", "b"):
+            (tmp_path / "artefacts" / f"toy-v1-{name}").mkdir(parents=True)
+        rename = Path.rename
+
+        def refused(path: Path, target: Path) -> Path:
+            if path.name == "toy-v1-a":
+                raise PermissionError(13, "Permission denied", str(path))
+            return rename(path, target)
+
+        monkeypatch.setattr(Path, "rename", refused)
+        assert store.sweep() == ["artefacts/toy-v1-b"]
+
+    def test_scratch_of_another_user_is_passed_over(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        store = Store(tmp_path)
+        (tmp_path / "scratch" / "toy-v1-a.01").mkdir(parents=True)
+        give_to_another_user(monkeypatch, tmp_path / "scratch")
+        assert (store.sweep(), held_directories(store.backend.scratch)) == ([], [])
+
+    def test_work_of_another_machine_on_nfs_is_left_alone(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        _keep_locks_of_directories_local(monkeypatch)
+        store, other = Store(tmp_path), Store(tmp_path)
+        with store.slot(stage="toy", version=1, key="toy-v1-aa") as slot:
+            (slot.path / "half").write_text("x")
+            assert (other.gc(dry_run=True), other.sweep(), other.sweep_scratch()) == ([], [], [])
+            assert (slot.path / "half").read_text() == "x"
+            assert held_directories(other.backend.scratch) == [slot.path.parent]
+        assert sorted(path.name for path in store.open(slot.ref).iterdir()) == ["half", MANIFEST]
+        assert held_directories(other.backend.scratch) == list((tmp_path / "scratch").iterdir()) == []
+
+    def test_work_of_an_earlier_version_is_left_alone(self, tmp_path: Path) -> None:
+        store, folder = Store(tmp_path), tmp_path / "scratch" / "toy-v1-aa.01"
+        folder.mkdir(parents=True)
+        lock = os.open(folder, os.O_RDONLY)
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        assert (store.sweep(), held_directories(store.backend.scratch)) == ([], [folder])
+        assert list(folder.iterdir()) == []
+        os.close(lock)
+        assert store.gc(dry_run=True) == ["scratch/toy-v1-aa.01"]
+        assert list(folder.iterdir()) == []
+        assert store.sweep() == ["scratch/toy-v1-aa.01"]
+        assert not folder.exists()
+
+    @pytest.mark.parametrize("nfs", [False, True])
+    @pytest.mark.parametrize("moment", ["open directory", "open lock", "flock directory", "flock lock"])
+    def test_a_sweep_beside_the_beginning_of_work(
+        self, moment: str, nfs: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        if nfs:
+            _keep_locks_of_directories_local(monkeypatch)
+        store, swept = Store(tmp_path), []
+
+        def sweep_first(call: Callable[..., Any], name: str) -> Callable[..., Any]:
+            def swept_first(what: Any, *args: Any, **options: Any) -> Any:
+                path = what if isinstance(what, Path) else Path(os.readlink(f"/proc/self/fd/{what}"))
+                place = "lock" if path.name == "lock" else "directory"
+                if f"{name} {place}" == moment and tmp_path / "scratch" in path.parents and not swept:
+                    swept.append("begun")
+                    swept.extend(store.sweep_scratch())
+                return call(what, *args, **options)
+
+            return swept_first
+
+        opened = os.open
+        monkeypatch.setattr(
+            os,
+            "open",
+            lambda what, *args, **options: (
+                sweep_first(opened, "open") if isinstance(what, Path) else opened
+            )(what, *args, **options),
+        )
+        monkeypatch.setattr(fcntl, "flock", sweep_first(fcntl.flock, "flock"))
+        with store.slot(stage="toy", version=1, key="toy-v1-aa") as slot:
+            assert held_directories(store.backend.scratch) == [slot.path.parent]
+            assert store.sweep() == []
+            (slot.path / "file").write_text("x")
+        assert swept
+        assert store.find("toy-v1-aa") == slot.ref
+        assert list((tmp_path / "scratch").iterdir()) == []
+
+    def test_a_lock_that_nfs_keeps_while_it_is_open_goes_with_its_directory(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        remove, close = os.unlink, os.close
+        renamed: list[Path] = []
+
+        def kept(path: Any, *args: Any, **options: Any) -> None:
+            if os.fspath(path) == "lock":
+                folder = Path(os.readlink(f"/proc/self/fd/{options['dir_fd']}"))
+                renamed.append(folder / ".nfs01")
+                (folder / "lock").rename(renamed[-1])
+            else:
+                remove(path, *args, **options)
+
+        def closed(descriptor: int) -> None:
+            place = Path(os.readlink(f"/proc/self/fd/{descriptor}"))
+            close(descriptor)
+            if place in renamed and place.exists():
+                remove(place)
+
+        monkeypatch.setattr(os, "unlink", kept)
+        monkeypatch.setattr(os, "close", closed)
+        put(Store(tmp_path))
+        assert renamed
+        assert list((tmp_path / "scratch").iterdir()) == []
+
+    def test_no_room_for_a_lock_leaves_nothing(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        opened = os.open
+        (tmp_path / "scratch" / "toy-v1-aa.01.removed").mkdir(parents=True)
+
+        def full(path: Any, flags: int, *args: Any, **options: Any) -> int:
+            if flags & os.O_CREAT and os.path.basename(path) == "lock":
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+            return opened(path, flags, *args, **options)
+
+        monkeypatch.setattr(os, "open", full)
+        store = Store(tmp_path)
+        with pytest.raises(StoreError, match="No space left"):
+            put(store)
+        assert store.sweep() == ["scratch/toy-v1-aa.01.removed"]
+        assert list((tmp_path / "scratch").iterdir()) == []
+
     def test_what_is_removed_while_it_is_made_anew_is_there_whole(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
@@ -368,6 +519,17 @@ class TestDirectory:
         assert refs[0] == refs[1] == refs[2]
         assert len(Store(tmp_path).ls()) == 20
         assert list((tmp_path / "scratch").iterdir()) == []
+
+
+def _keep_locks_of_directories_local(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on an NFS client, which asks the server for locks of files alone: no machine sees the other's."""
+    lock = fcntl.flock
+
+    def local(descriptor: int, kind: int) -> None:
+        if not stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            lock(descriptor, kind)
+
+    monkeypatch.setattr(fcntl, "flock", local)
 
 
 def _put_many(root: str) -> list[Ref]:
@@ -407,6 +569,43 @@ class TestUrl:
         assert store.sweep(older_than_hours=1.0) == []
         assert sorted(store.sweep(older_than_hours=0.0)) == ["toy-v1-aa/loser", "toy-v1-bb/attempt"]
         assert store.verify(ref)
+
+    @pytest.mark.parametrize("scheme", ["memory", "local"])
+    @pytest.mark.parametrize("moment", ["find", "rm"])
+    def test_two_machines_sweep_at_once(
+        self, scheme: str, moment: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        place = uuid.uuid4().hex if scheme == "memory" else f"{tmp_path}/store"
+        store, other = (Store(f"{scheme}://{place}", cache=tmp_path / name) for name in ("here", "there"))
+        backend: Any = store.backend
+        ref = put(store)
+        for name in ("toy-v1-bb/one", "toy-v1-bb/two", "toy-v1-cc/one"):
+            backend.fs.makedirs(f"{backend.prefix}/{name}", exist_ok=True)
+            backend.fs.pipe_file(f"{backend.prefix}/{name}/half", b"x")
+        call, swept = getattr(backend.fs, moment), []
+
+        def other_first(*args: Any, **options: Any) -> Any:
+            listed = call(*args, **options) if moment == "find" else None
+            if not swept:
+                swept.append("begun")
+                swept.extend(other.sweep(older_than_hours=-0.1))
+            return listed if moment == "find" else call(*args, **options)
+
+        monkeypatch.setattr(backend.fs, moment, other_first)
+        assert store.sweep(older_than_hours=-0.1) == []
+        assert swept == ["begun", "toy-v1-bb/one", "toy-v1-bb/two", "toy-v1-cc/one"]
+        assert store.keys() == ["toy-v1-aa"]
+        assert store.verify(ref)
+
+    def test_an_empty_folder_is_as_old_as_it_is(self, tmp_path: Path) -> None:
+        store = Store(f"local://{tmp_path}/store", cache=tmp_path / "cache")
+        put(store)
+        begun, old = (tmp_path / "store" / "toy-v1-bb" / name for name in ("begun", "old"))
+        begun.mkdir(parents=True)
+        old.mkdir()
+        os.utime(old, (0, 0))
+        assert store.sweep() == ["toy-v1-bb/old"]
+        assert (begun.exists(), old.exists()) == (True, False)
 
     def test_local_copies_go_with_what_they_are_copies_of(self, tmp_path: Path) -> None:
         store = Store(f"memory://{uuid.uuid4().hex}", cache=tmp_path)

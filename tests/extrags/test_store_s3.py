@@ -128,6 +128,28 @@ def test_an_upload_that_fails_is_invisible_and_swept(store: Store, monkeypatch: 
     assert store.verify(put(store))
 
 
+@pytest.mark.parametrize("moment", ["find", "rm"])
+def test_two_machines_sweep_at_once(
+    store: Store, url: str, moment: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    backend: Any = store.backend
+    for index in range(3):
+        backend.fs.pipe_file(f"{backend.prefix}/toy-v1-{index}/attempt/half", b"x")
+    other = Store(url, cache=tmp_path / "there")
+    call, swept = getattr(backend.fs, moment), []
+
+    def other_first(*args: Any, **options: Any) -> Any:
+        listed = call(*args, **options) if moment == "find" else None
+        if not swept:
+            swept.append("begun")
+            swept.extend(other.sweep(older_than_hours=-0.1))
+        return listed if moment == "find" else call(*args, **options)
+
+    monkeypatch.setattr(backend.fs, moment, other_first)
+    assert len(store.sweep(older_than_hours=-0.1)) + len(swept) - 1 in (3, 4)
+    assert store.keys() == []
+
+
 def test_a_removal_beside_an_upload_spares_it(store: Store, tmp_path: Path) -> None:
     put(store, seed=1)
     backend: Any = store.backend

@@ -198,9 +198,9 @@ class TestMatrix:
     def test_on_the_command_line(self) -> None:
         from flows.commands.run import parsed_matrix, parsed_methods
 
-        assert parsed_matrix(["coarse.iterations=500,1000", "enhance.channels=[8,8,16],[4,4,8]"]) == {
+        assert parsed_matrix(["coarse.iterations=500,1000", "enhance.channels=[8,8,16],[16,16,32]"]) == {
             "coarse.iterations": [500, 1000],
-            "enhance.channels": [(8, 8, 16), (4, 4, 8)],
+            "enhance.channels": [(8, 8, 16), (16, 16, 32)],
         }
         assert parsed_methods(["3dgs,coarse", "extrags"], "coarse") == ["3dgs", "coarse", "extrags"]
         assert parsed_methods([], "coarse") == ["coarse"]

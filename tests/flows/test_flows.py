@@ -268,6 +268,26 @@ def test_leftovers_are_looked_for_by_the_outer_run_alone(inner: bool, tmp_path: 
     assert (tmp_path / "scratch" / "left").exists() is inner
 
 
+@pytest.mark.parametrize("step", ["Store.sweep", "sweep_locks", "file_killed", "sweep_unreadable"])
+def test_leftovers_that_cannot_be_removed_end_no_run(
+    step: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fails(*_: object, **__: object) -> list[str]:
+        raise StoreError("the server is busy")
+
+    monkeypatch.setattr(f"flows.sequence.{step}", fails)
+    (tmp_path / "scratch" / "left").mkdir(parents=True)
+    assert open_store(str(tmp_path)).root == str(tmp_path)
+    assert "could not all be removed: the server is busy" in caplog.text
+    assert (tmp_path / "scratch" / "left").exists() is (step == "Store.sweep")
+
+
+def test_a_store_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(StoreError, match="cannot be written"):
+        open_store(str(tmp_path / "file" / "store"))
+
+
 class TestParameters:
     def test_seed_reaches_every_stage(self) -> None:
         config = pipeline_config("quick", None, 7)
