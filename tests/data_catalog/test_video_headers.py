@@ -118,7 +118,6 @@ class TestOrientation:
             ((0, ONE, ONE, 0), lambda image: image.swapaxes(0, 1), "mirrored, with rows as columns"),
             ((0, -ONE, -ONE, 0), lambda image: np.rot90(image, 2).swapaxes(0, 1), "mirrored, with rows"),
         ],
-        ids=str,
     )
     def test_as_players_show_it(self, tmp_path, caplog, matrix, shown, told) -> None:
         """FFmpeg's autorotate turns and mirrors by the same matrices."""
