@@ -13,6 +13,7 @@ from pydantic import AllowInfNan, BaseModel, Field, ValidationError
 
 from extrags.config import PROFILES, PipelineConfig, profile_config
 from extrags.config.base import LARGEST_WHOLE_NUMBER, has_largest
+from extrags.config.restorer import LevelWidth
 from extrags.config.settings import Setting, groups_of, settings_of
 from extrags.errors import ConfigError
 
@@ -140,7 +141,16 @@ def values(setting: Setting) -> st.SearchStrategy[Any]:
     }
     limited = (Annotated[kind, setting.name, *by_kind[kind]] for kind in kinds if kind in by_kind)
     free = (kind for kind in kinds if kind not in (int, float, str))
-    return st.one_of(*(st.from_type(kind) for kind in (*limited, *free)))
+    return st.one_of(*(of_kind(kind) for kind in (*limited, *free)))
+
+
+def of_kind(kind: Any) -> st.SearchStrategy[Any]:
+    """Values of a type, limits within it included."""
+    if get_origin(kind) is tuple and get_args(kind) == (LevelWidth,) * 3:
+        # What pydantic keeps within a tuple is passed over by hypothesis.
+        width = st.integers(1, LARGEST_WHOLE_NUMBER // 8).map(lambda eighth: 8 * eighth)
+        return st.tuples(width, width, width)
+    return st.from_type(kind)
 
 
 class TestSettings:

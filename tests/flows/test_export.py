@@ -325,7 +325,7 @@ class TestUsage:
             assert file.parent.is_dir()
             raise KeyboardInterrupt
 
-        monkeypatch.setattr(transforms_json, "_write_points", interrupted)
+        monkeypatch.setattr(transforms_json, "write_ply_points", interrupted)
         with pytest.raises(KeyboardInterrupt):
             export(finished, "--to", "transforms", "-o", str(tmp_path / "new" / "scene"))
         assert list(tmp_path.iterdir()) == []
