@@ -131,6 +131,11 @@ def values(setting: Setting) -> st.SearchStrategy[Any]:
     """Anything a setting takes."""
     if setting.choices and setting.annotation is str:
         return st.sampled_from(setting.choices)
+    step = next((limit.multiple_of for limit in setting.limits if hasattr(limit, "multiple_of")), None)
+    if step is not None:
+        # Of which hypothesis knows nothing.
+        (least,) = (limit.ge for limit in setting.limits if hasattr(limit, "ge"))
+        return st.integers(-(-least // step), LARGEST_WHOLE_NUMBER // step).map(lambda part: step * part)
     union = get_origin(setting.annotation) in (Union, UnionType)
     kinds: tuple[Any, ...] = get_args(setting.annotation) if union else (setting.annotation,)
     largest = () if has_largest(setting.limits) else Field(le=LARGEST_WHOLE_NUMBER).metadata
