@@ -211,7 +211,10 @@ class Trials:
         self.command = Command(self.folder / "store", self.runner, self.folder / "commands.log")
         self.counts: Counter[str] = Counter()
         self.hits: Counter[str] = Counter()
-        assert self.command.start().wait() == 0, f"see {self.command.log}"
+        # Twice: at first workers load what they need, and times of that run would put kills after the commit.
+        for _ in range(2):
+            self.store.rm("*")
+            assert self.command.start().wait() == 0, f"see {self.command.log}"
         manifests = self.store.ls()
         self.undisturbed = {manifest.key: manifest.digest for manifest in manifests}
         stages = sorted(manifests, key=lambda manifest: manifest.started)
