@@ -6,8 +6,9 @@ neither torch nor the stages.
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from extrags.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from extrags.poses.calibration import check_lens_use, with_calibration
@@ -53,11 +54,7 @@ _MODULES = {
     "with_estimated_poses": "estimate",
 }
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
+__getattr__ = lazy_names(__name__, _MODULES)
 
 
 def __dir__() -> list[str]:

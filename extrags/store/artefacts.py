@@ -10,12 +10,12 @@ import shutil
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from extrags.errors import ArtefactGoneError, ConfigError, DamagedArtefactError, StoreError
 from extrags.redaction import has_credentials, without_credentials, without_credentials_in
+from extrags.store.artefact_names import found_by, keys_of_other_places, matches
 from extrags.store.canonical import Ref
 from extrags.store.directory import ABOUT, DirectoryBackend, private_directory, sweep_directories
 from extrags.store.integrity import Damage, Depth, default_depth, find_damage, list_contents
@@ -423,7 +423,7 @@ class Store:
             StoreError: as `manifests`.
         """
         found, _ = self.manifests()
-        return [item for item in found if _matches(pattern, item.key, *_about(item))]
+        return [item for item in found if matches(pattern, item.key, *found_by(item))]
 
     def manifests(self) -> tuple[list[Manifest], list[str]]:
         """Manifests of all artefacts, and keys of those whose manifest cannot be read, with a warning each.
@@ -479,12 +479,12 @@ class Store:
             else:
                 if manifest is None:
                     continue
-                about, started = _about(manifest), manifest.started
+                about, started = found_by(manifest), manifest.started
                 if pattern == manifest.label and pattern not in (key, manifest.stage):
                     named.setdefault(manifest.place, []).append(key)
-            if _matches(pattern, key, *about):
+            if matches(pattern, key, *about):
                 chosen.append((started, key))
-        spared = _of_other_places(pattern, named, here)
+        spared = keys_of_other_places(pattern, named, here)
         return [key for _, key in sorted(chosen) if key not in spared and self.backend.discard(key)]
 
     def sweep_scratch(self) -> list[str]:
@@ -550,47 +550,6 @@ def _as_damage(error: StoreError, key: str, root: str) -> DamagedArtefactError:
         raise error
     problem = f"cannot be read: {cause.strerror}"
     return DamagedArtefactError(problem, file=MANIFEST, stage=stage_of(key), key=key, store=root)
-
-
-def _matches(pattern: str, *names: str) -> bool:
-    """Whether one of the names is meant, exactly or by a shell pattern: a folder's may have brackets."""
-    return any(name == pattern or fnmatchcase(name, pattern) for name in names)
-
-
-def _about(manifest: Manifest) -> list[str]:
-    """What an artefact is found by, beside its key."""
-    return [manifest.stage, manifest.label, *([manifest.place] if manifest.place else [])]
-
-
-def _of_other_places(name: str, named: Mapping[str, list[str]], here: str | None) -> set[str]:
-    """Keys of artefacts of that name that are not of the sequence which is meant.
-
-    Args:
-        name: a relative path.
-        named: keys by place; empty where it is not known.
-        here: which place is meant; None where that is not known.
-
-    Raises:
-        StoreError: when none of the places is meant, or it is not known which.
-    """
-    places = sorted(place for place in named if place)
-    if here in places:
-        # Of a single known place are also those from before there were places.
-        others = set(places) - {here} | ({""} if len(places) > 1 else set())
-        spared = {key for place in others for key in named.get(place, [])}
-        if spared:
-            log.warning(
-                "%s: artefacts of that name in other places, or in one that is not known, are left: %d",
-                name,
-                len(spared),
-            )
-        return spared
-    if len(places) > 1 or (places and here is not None):
-        said = f", not {here}" if here is not None else ""
-        raise StoreError(
-            f"{name} is in this store the name of {' and '.join(places)}{said}; name one of these by its path"
-        )
-    return set()
 
 
 def _key_of(ref: Ref) -> str:

@@ -282,6 +282,10 @@ class TestRefiner:
             assert examples_of([file], start_of_refiner("colons")) == []
         assert told[-1] == Progress("refiner-examples", 1, 1)
 
+    def test_what_a_scene_told_a_restorer_is_forgotten(self, tmp_path: Path) -> None:
+        start_of_refiner("colons").restorer.cloning_seamlessly().save(tmp_path)
+        assert not start_of_refiner(str(tmp_path)).restorer.seamless
+
     def test_wrong_settings_are_named(
         self, given: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
