@@ -66,7 +66,7 @@ def restoring_settings(config: EnhanceConfig, finish: Finish) -> EnhanceConfig:
     return settings.model_copy(update={"precision": chosen_precision(config)})
 
 
-@stage("evaluate-restore", version=15)
+@stage("evaluate-restore", version=16)
 def restore(
     slot: Slot,
     renders: Ref,

@@ -18,6 +18,7 @@ from torch import Tensor
 __all__ = ["BorderRule", "filter_figures", "filter_separable", "gaussian_weights"]
 
 BorderRule = Literal["reflect", "replicate"]
+FitRule = Literal["linear"]
 
 CV_DTYPES = (torch.float32, torch.float64)
 LARGEST_MATRIX_PX = 384
@@ -28,7 +29,7 @@ def filter_separable(
     maps: Float[Tensor, "*b h w"],
     weights_x: tuple[float, ...],
     weights_y: tuple[float, ...],
-    border: BorderRule = "reflect",
+    border: BorderRule | FitRule = "reflect",
 ) -> Float[Tensor, "*b h w"]:
     """Correlate each map with the outer product of two odd-length rows of weights.
 
@@ -37,7 +38,9 @@ def filter_separable(
         weights_x: weights along the width, centre in the middle.
         weights_y: weights along the height.
         border: `reflect` mirrors about the border pixel (which is not repeated), `replicate`
-            repeats the border pixel.
+            repeats the border pixel, `linear` takes the weights that are left inside and fits a line by
+            them, for symmetric weights above zero: what is linear along the axes stays as it is up to the
+            border, where it may leave the range of the values.
 
     Returns:
         Filtered maps of the same size.
@@ -91,7 +94,11 @@ def filter_figures(
 # A cached tensor may be created in inference mode and used with autograd later.
 @lru_cache(maxsize=128)
 @torch.inference_mode(False)
-def _filter_matrix(size: int, weights: tuple[float, ...], border: BorderRule) -> Float[Tensor, "s s"]:
+def _filter_matrix(
+    size: int, weights: tuple[float, ...], border: BorderRule | FitRule
+) -> Float[Tensor, "s s"]:
+    if border == "linear":
+        return _fit_matrix(size, weights)
     radius = len(weights) // 2
     positions = torch.arange(size)[:, None] + torch.arange(-radius, radius + 1)[None]
     if border == "replicate":
@@ -104,3 +111,16 @@ def _filter_matrix(size: int, weights: tuple[float, ...], border: BorderRule) ->
     matrix = torch.zeros(size, size, dtype=torch.float64)
     taps = torch.tensor(weights, dtype=torch.float64).expand(size, -1)
     return matrix.scatter_add_(1, sources, taps)
+
+
+def _fit_matrix(size: int, weights: tuple[float, ...]) -> Float[Tensor, "s s"]:
+    """The value at each pixel of the line that fits its neighbours best, by weights of their distance."""
+    radius = len(weights) // 2
+    offsets = torch.arange(size)[None] - torch.arange(size)[:, None]
+    taps = torch.tensor(weights, dtype=torch.float64)[(offsets + radius).clamp(0, 2 * radius)]
+    taps = torch.where(offsets.abs() <= radius, taps, 0.0)
+    zeroth, first, second = ((taps * offsets**power).sum(dim=1, keepdim=True) for power in range(3))
+    spread = zeroth * second - first**2
+    # Without neighbours there is no slope, and the pixel stays as it is.
+    fitted = taps * torch.where(spread > 0, (second - first * offsets) / spread, 1 / zeroth)
+    return torch.where(first == 0, taps / zeroth, fitted)

@@ -287,8 +287,7 @@ class _Surface:
     @classmethod
     def of_view(cls, camera: Cameras, depth_mm: Float[Tensor, "h w"], texel_mm: float) -> _Surface:
         rays = torch.from_numpy(pixel_rays(camera).astype(np.float32))[0]
-        window = gaussian_weights(DEPTH_SIGMA_PX, DEPTH_RADIUS_PX)
-        normals = depth_normals(rays, filter_separable(depth_mm[None, None], window, window)[0])
+        normals = depth_normals(rays, _smoothed(depth_mm[None]))
         center = torch.from_numpy(camera.centers.astype(np.float32))[0]
         return cls(
             center + rays * depth_mm[..., None],
@@ -296,6 +295,14 @@ class _Surface:
             (functional.normalize(rays, dim=-1) * normals).sum(-1).abs(),
             depth_mm / float(camera.K[0, 0, 0]) / texel_mm,
         )
+
+
+def _smoothed(depth_mm: Float[Tensor, "*v h w"]) -> Float[Tensor, "*v h w"]:
+    """Depth whose slope is kept up to the border of the image, within the range of each view."""
+    window = gaussian_weights(DEPTH_SIGMA_PX, DEPTH_RADIUS_PX)
+    least, most = torch.aminmax(depth_mm.flatten(-2), dim=-1)
+    fitted = filter_separable(depth_mm, window, window, "linear")
+    return torch.minimum(torch.maximum(fitted, least[..., None, None]), most[..., None, None])
 
 
 @dataclass(frozen=True)
@@ -323,8 +330,7 @@ def _places(
 ) -> _Places:
     """Candidates for tiles on a grid of pixels, where the wall is known, trusted and seen face on."""
     rays = torch.from_numpy(pixel_rays(views.cameras).astype(np.float32))
-    window = gaussian_weights(DEPTH_SIGMA_PX, DEPTH_RADIUS_PX)
-    smooth = filter_separable(depth, window, window)
+    smooth = _smoothed(depth)
     stride = TILE_TEXELS // 3
     grid = (slice(stride // 2, None, stride), slice(stride // 2, None, stride))
     found = []

@@ -283,22 +283,39 @@ def _surface(camera: Cameras, depth_mm: Float[Tensor, "1 h w"], stride: int) -> 
 def depth_normals(rays: Float[Tensor, "h w 3"], depth_mm: Float[Tensor, "1 h w"]) -> Float[Tensor, "h w 3"]:
     """Unit normals of the surface that a depth map without gaps describes, in the rays' frame.
 
-    Differences over a few pixels: what a lamp shades is the wall, not the roughness of a rendered depth.
+    Differences over a few pixels: what a lamp shades is the wall, not the roughness of a rendered depth. They
+    are exact on planes, up to the border of the image; along an axis with a single pixel the surface is taken
+    to face the camera.
 
     Args:
         rays: of each pixel, at unit z-depth.
         depth_mm: z-depth.
+
+    Returns:
+        Normals that point away from the camera.
     """
     window = gaussian_weights(NORMAL_SIGMA_PX, NORMAL_RADIUS_PX)
-    smooth = 1 / filter_separable(1 / depth_mm[None].clamp_min(1e-9), window, window)[0, 0]
-    points = rays * smooth[..., None]
-    along = points.roll(-1, 1) - points.roll(1, 1)
-    down = points.roll(-1, 0) - points.roll(1, 0)
-    along[:, 0], along[:, -1] = along[:, 1], along[:, -2]
-    down[0], down[-1] = down[1], down[-2]
-    normal = torch.linalg.cross(along, down)
+    inverse = 1 / depth_mm[0].clamp_min(1e-9)
+    # Of a plane it is linear along rows and columns. Beside a step the line may fall below zero.
+    inverse = filter_separable(inverse, window, window, "linear").clamp(inverse.min(), inverse.max())
+    points = rays / inverse[..., None]
+    along, down = _differences(points, 1), _differences(points, 0)
+    if points.shape[1] == 1:
+        along = torch.linalg.cross(down, rays)
+    if points.shape[0] == 1:
+        down = torch.linalg.cross(rays, along)
+    normal = torch.linalg.cross(along, down) if points.shape[:2] != (1, 1) else rays
     unit: Tensor = normal / normal.norm(dim=-1, keepdim=True).clamp_min(1e-20)
     return unit
+
+
+def _differences(points: Float[Tensor, "h w 3"], axis: int) -> Float[Tensor, "h w 3"]:
+    """Differences per two pixels, of second order at the border too; zero along an axis with one pixel."""
+    size = points.shape[axis]
+    if size == 1:
+        return torch.zeros_like(points)
+    (slope,) = torch.gradient(points, dim=axis, edge_order=2 if size > 2 else 1)
+    return 2 * slope
 
 
 def _camera_rays(camera: Cameras) -> Float[Tensor, "h w 3"]:

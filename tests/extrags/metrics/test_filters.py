@@ -76,3 +76,22 @@ def test_half_precision_stays_with_the_matrices() -> None:
     maps = torch.rand(1, 40, LARGEST_MATRIX_PX + 1, generator=torch.Generator().manual_seed(7)).bfloat16()
     window = gaussian_weights(1.5, 5)
     assert torch.equal(filter_figures(maps, window, window), filter_separable(maps, window, window))
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 5, 20])
+def test_a_line_fitted_at_the_border_keeps_slopes(size: int) -> None:
+    window = gaussian_weights(1.5, 4)
+    down, across = torch.meshgrid(torch.arange(size), torch.arange(size + 1), indexing="ij")
+    slanted = 0.3 + 2.0 * down.double() - 0.7 * across.double()
+    torch.testing.assert_close(
+        filter_separable(slanted, window, window, "linear"), slanted, atol=1e-12, rtol=0
+    )
+
+
+def test_a_line_fitted_is_the_filter_itself_inside() -> None:
+    window = gaussian_weights(1.5, 4)
+    maps = torch.rand(2, 14, 19, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
+    inside = (..., slice(4, -4), slice(4, -4))
+    plain = filter_separable(maps, window, window)
+    fitted = filter_separable(maps, window, window, "linear")
+    torch.testing.assert_close(fitted[inside], plain[inside], atol=1e-14, rtol=0)

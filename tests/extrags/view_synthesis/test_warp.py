@@ -148,6 +148,60 @@ def test_the_angle_to_the_wall_is_compensated() -> None:
     assert errors[0] < 0.6 * errors[1]
 
 
+def _rays(width: int, height: int) -> Tensor:
+    focal = 0.6 * max(width, height)
+    K = np.array([[focal, 0, 0.47 * width], [0, focal, 0.52 * height], [0, 0, 1]])
+    return torch.from_numpy(pixel_rays(Cameras(K[None], np.eye(4)[None], width, height))[0])
+
+
+def _angles_deg(found: Tensor, true: Tensor) -> Tensor:
+    sines = torch.linalg.cross(found, true.expand_as(found)).norm(dim=-1)
+    assert float((found * true).sum(-1).min()) > 0
+    return torch.rad2deg(torch.asin(sines.clamp(max=1)))
+
+
+@pytest.mark.parametrize("size", [(64, 48), (40, 60), (3, 3), (2, 2), (2, 9)])
+def test_normals_of_a_plane_are_exact_up_to_the_border(size: tuple[int, int]) -> None:
+    rays = _rays(*size)
+    normal = torch.nn.functional.normalize(torch.tensor([0.3, -0.5, 1.0], dtype=torch.float64), dim=0)
+    found = depth_normals(rays, (20 / (rays @ normal))[None])
+    assert float(_angles_deg(found, normal).max()) < 1e-6
+
+
+def test_normals_within_a_sphere_are_right_to_first_order_at_the_border() -> None:
+    rays, radius = _rays(64, 48), 30.0
+    center = torch.tensor([3.0, -2.0, 10.0], dtype=torch.float64)
+    squared, along = rays.square().sum(-1), rays @ center
+    depth = (along + torch.sqrt(along**2 - squared * (center @ center - radius**2))) / squared
+    angles = _angles_deg(depth_normals(rays, depth[None]), (rays * depth[..., None] - center) / radius)
+    assert float(angles[5:-5, 5:-5].max()) < 0.2
+    # Mirrored at the border, depth seemed to have no slope there: up to 38 degrees.
+    assert float(angles.max()) < 2.0
+
+
+@pytest.mark.parametrize("size", [(1, 9), (9, 1), (1, 1)])
+def test_images_of_one_pixel_have_normals_that_face_the_camera(size: tuple[int, int]) -> None:
+    rays = _rays(*size)
+    found = depth_normals(rays, torch.full((1, *rays.shape[:2]), 7.0, dtype=torch.float64))
+    lengths = found.norm(dim=-1)
+    torch.testing.assert_close(lengths, torch.ones_like(lengths))
+    across = 0 if size[0] == 1 else 1
+    towards = torch.nn.functional.normalize(rays, dim=-1)
+    if size == (1, 1):
+        torch.testing.assert_close(found, towards)
+    else:
+        # A fronto-parallel wall, known along one axis alone.
+        assert float(found[..., 1 - across].abs().max()) < 1e-9
+        assert float((found * towards).sum(-1).min()) > 0.5
+
+
+def test_normals_beside_a_step_in_depth_are_finite() -> None:
+    depth = torch.ones(1, 12, 12)
+    depth[..., 2:] = 1e4
+    found = depth_normals(_rays(12, 12).float(), depth)
+    torch.testing.assert_close(found.norm(dim=-1), torch.ones(12, 12))
+
+
 def test_far_from_the_origin_of_the_world() -> None:
     light, cameras, _, depth = _target()
     references = exact_references(tube_cameras(8), light)
