@@ -64,7 +64,7 @@ def clean_store(store: Store, policy: Policy, *, dry_run: bool = False) -> Clean
         dry_run: remove nothing.
     """
     done = Cleaned()
-    done.leftovers += done.attempt(lambda: store.gc(dry_run=dry_run)) or []
+    done.leftovers += done.attempt(lambda: store.gc(dry_run=dry_run, refused=done.problems)) or []
     if not dry_run:
         done.leftovers += done.attempt(lambda: sweep_locks(store.locks)) or []
     done.leftovers += done.attempt(lambda: sweep_unreadable(store, dry_run=dry_run)) or []

@@ -9,7 +9,7 @@ import logging
 import shutil
 import time
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -17,7 +17,13 @@ from extrags.errors import ArtefactGoneError, ConfigError, DamagedArtefactError,
 from extrags.redaction import has_credentials, without_credentials, without_credentials_in
 from extrags.store.artefact_names import found_by, keys_of_other_places, matches
 from extrags.store.canonical import Ref
-from extrags.store.directory import ABOUT, DirectoryBackend, private_directory, sweep_directories
+from extrags.store.directory import (
+    ABOUT,
+    DirectoryBackend,
+    private_directory,
+    remove_entries,
+    sweep_directories,
+)
 from extrags.store.integrity import Damage, Depth, default_depth, find_damage, list_contents
 from extrags.store.kept import kept_or_read
 from extrags.store.manifest import MANIFEST, Manifest, is_name, software_versions, stage_of
@@ -502,28 +508,39 @@ class Store:
         """
         return self.backend.sweep(older_than_hours)
 
-    def gc(self, *, older_than_hours: float = 24.0, dry_run: bool = False) -> list[str]:
+    def gc(
+        self,
+        *,
+        older_than_hours: float = 24.0,
+        dry_run: bool = False,
+        refused: list[StoreError] | None = None,
+    ) -> list[str]:
         """Garbage collection: `sweep`, files of failures and damaged artefacts that were set aside.
 
-        Which whole artefacts go is the matter of `extrags.store.retention`.
+        Which whole artefacts go is the matter of `extrags.store.retention`. What cannot be removed hinders
+        nothing else.
 
         Args:
             older_than_hours: as in `sweep`.
             dry_run: remove nothing.
+            refused: takes what could not be removed, with the reason.
 
         Returns:
             Names of what was removed, or would be.
+
+        Raises:
+            StoreError: once all else is removed, of the first that could not be, where `refused` is not
+                given.
         """
         removed = self.backend.sweep(older_than_hours, dry_run=dry_run)
-        failures = self.state / "failed"
-        if failures.is_dir():
-            for entry in sorted(failures.iterdir()):
-                removed.append(f"failed/{entry.name}")
-                if not dry_run:
-                    # Another machine may clean the same store at the same hour.
-                    with suppress(FileNotFoundError):
-                        shutil.rmtree(entry)
-        return removed + self.backend.remove_damaged(dry_run=dry_run)
+        failures = remove_entries(self.state / "failed", dry_run=dry_run)
+        damaged = self.backend.remove_damaged(dry_run=dry_run)
+        problems = failures[1] + damaged[1]
+        if refused is not None:
+            refused += problems
+        elif problems:
+            raise problems[0]
+        return removed + failures[0] + damaged[0]
 
 
 def _tells_damage(error: StoreError) -> bool:

@@ -27,6 +27,7 @@ __all__ = [
     "DirectoryBackend",
     "held_directories",
     "private_directory",
+    "remove_entries",
     "sweep_directories",
 ]
 
@@ -168,14 +169,10 @@ class DirectoryBackend:
             return None
         return str(place)
 
-    def remove_damaged(self, *, dry_run: bool = False) -> list[str]:
-        """Remove what was set aside; returns the names."""
-        place = self.root / DAMAGED
-        names = sorted(os.listdir(place)) if place.is_dir() else []
+    def remove_damaged(self, *, dry_run: bool = False) -> tuple[list[str], list[StoreError]]:
+        """Remove what was set aside; returns the names, and what could not be removed, with the reason."""
         # One by one: what is set aside meanwhile stays.
-        for name in [] if dry_run else names:
-            shutil.rmtree(place / name, ignore_errors=True)
-        return [f"{DAMAGED}/{name}" for name in names]
+        return remove_entries(self.root / DAMAGED, dry_run=dry_run)
 
     def write_record(self, name: str, text: bytes) -> None:
         """Write `records/<name>`; one that is there is replaced at once, never half."""
@@ -435,6 +432,36 @@ def sweep_directories(parent: Path, *, dry_run: bool = False) -> list[str]:
         if dry_run or not path.exists():
             removed.append(f"{parent.name}/{name}")
     return removed
+
+
+def remove_entries(parent: Path, *, dry_run: bool = False) -> tuple[list[str], list[StoreError]]:
+    """Remove what is below `parent`, each by itself; its names, and why others could not be removed.
+
+    Of a folder of which a part could not be removed the rest is gone.
+    """
+    removed: list[str] = []
+    refused: list[StoreError] = []
+    try:
+        names = sorted(os.listdir(parent))
+    except FileNotFoundError:
+        return removed, refused
+    except OSError as error:
+        refused.append(StoreError(f"{parent} cannot be listed: {error.strerror or error}"))
+        return removed, refused
+    for name in names:
+        path = parent / name
+        try:
+            if not dry_run:
+                # Another machine may clean the same store at the same hour.
+                with suppress(FileNotFoundError):
+                    shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
+        except OSError as error:
+            problem = StoreError(f"{path} cannot be removed: {error.strerror or error}")
+            problem.__cause__ = error
+            refused.append(problem)
+        else:
+            removed.append(f"{parent.name}/{name}")
+    return removed, refused
 
 
 def _directories(parent: Path) -> list[str]:

@@ -233,13 +233,13 @@ class UrlBackend:
         self._remove_empty(f"{self.prefix}/{key}")
         return f"{self.url}/{DAMAGED}/{place.rsplit('/', 1)[-1]}"
 
-    def remove_damaged(self, *, dry_run: bool = False) -> list[str]:
-        """Remove what was set aside; returns the names."""
+    def remove_damaged(self, *, dry_run: bool = False) -> tuple[list[str], list[StoreError]]:
+        """Remove what was set aside, all at once; returns the names, as that of a directory does."""
         place = f"{self.prefix}/{DAMAGED}"
         names = sorted(name for name, _ in self._children(place))
         if names and not dry_run:
             self._remove_all(place)
-        return [f"{DAMAGED}/{name}" for name in names]
+        return [f"{DAMAGED}/{name}" for name in names], []
 
     def _copy_of(self, manifest: Manifest) -> Path:
         return self.local / f"{manifest.key}.{manifest.digest}"

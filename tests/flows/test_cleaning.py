@@ -17,6 +17,7 @@ from extrags.store.directory import DirectoryBackend
 from flows.cleaning import clean_store
 from flows.cli import main
 from flows.retention import retention
+from tests.other_user import give_to_another_user
 
 
 @pytest.fixture
@@ -71,6 +72,23 @@ def test_leftovers_that_cannot_be_removed_keep_no_artefact(
     ]
     with pytest.raises(StoreError, match=r"failed/coarse: Permission denied \(and 1 more\)"):
         done.check()
+
+
+@pytest.mark.usefixtures("untouched_environment")
+@pytest.mark.parametrize("kind", ["failed", "damaged"])
+def test_files_of_a_failure_that_cannot_be_removed_keep_no_others(
+    kind: str, store: Store, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folders = [Path(store.root) / kind / name for name in ("coarse-v1-0", "depth-v1-0", "ingest-v1-0")]
+    for folder in folders:
+        folder.mkdir(parents=True)
+        (folder / "error.json").write_text("{}")
+    give_to_another_user(monkeypatch, folders[1])
+    assert main(["cache", "gc", "--store", store.root]) == 1
+    said = capsys.readouterr()
+    assert f"{kind}/coarse-v1-0\n{kind}/ingest-v1-0\n2 leftovers removed" in said.out
+    assert f"{kind}/depth-v1-0 cannot be removed: Permission denied" in said.err
+    assert [folder.exists() for folder in folders] == [False, True, False]
 
 
 @pytest.mark.usefixtures("untouched_environment")
