@@ -455,7 +455,19 @@ class Store:
         return sorted(found, key=lambda manifest: (manifest.started, manifest.key)), unreadable
 
     def rm(self, pattern: str, *, here: str | None = None) -> list[str]:
-        """Remove artefacts by a shell pattern over key, stage, label or place; returns their keys.
+        """Remove artefacts by a shell pattern, as `removable` chooses them; returns their keys.
+
+        Args:
+            pattern: of the names.
+            here: absolute path that the pattern names for who gives it; None for none.
+
+        Raises:
+            StoreError: as `removable`, before anything is removed, and when one cannot be removed.
+        """
+        return [key for key in self.removable(pattern, here=here) if self.backend.discard(key)]
+
+    def removable(self, pattern: str, *, here: str | None = None) -> list[str]:
+        """Keys of artefacts to remove by a shell pattern over key, stage, label or place, the oldest first.
 
         A relative path may be the name of several sequences: where it is the pattern, those in one place go.
 
@@ -467,8 +479,8 @@ class Store:
             here: absolute path that the pattern names for who gives it; None for none.
 
         Raises:
-            StoreError: as `manifests`, when one cannot be removed, and when the pattern names sequences in
-                several places, or in another one than here.
+            StoreError: as `manifests`, and when the pattern names sequences in several places, or in another
+                one than here.
         """
         chosen = []
         named: dict[str, list[str]] = {}
@@ -491,7 +503,7 @@ class Store:
             if matches(pattern, key, *about):
                 chosen.append((started, key))
         spared = keys_of_other_places(pattern, named, here)
-        return [key for _, key in sorted(chosen) if key not in spared and self.backend.discard(key)]
+        return [key for _, key in sorted(chosen) if key not in spared]
 
     def sweep_scratch(self) -> list[str]:
         """Remove scratch directories of killed processes of this machine alone; as `sweep`, but at once."""

@@ -229,25 +229,37 @@ def rm(given: argparse.Namespace) -> int:
 
     Raises:
         StoreError: when there is no such store, nothing in it matches, or a relative path is the name of
-            sequences in other places.
+            sequences in other places, before anything is removed; when something could not be removed, once
+            all else has been.
     """
     from data_catalog.names import path_of
 
     store = _looked_into(given)
-    removed = [
+    # Of all patterns before the first artefact goes: one that is refused leaves the store as it is.
+    keys = dict.fromkeys(
         key
         for given_as in given.patterns
         for pattern in _spellings(given_as)
-        for key in store.rm(pattern, here=path_of(pattern))
-    ]
-    if not removed:
+        for key in store.removable(pattern, here=path_of(pattern))
+    )
+    removed: list[str] = []
+    problems: list[StoreError] = []
+    for key in keys:
+        try:
+            if store.backend.discard(key):
+                print(key)
+                removed.append(key)
+        except StoreError as error:
+            problems.append(error)
+    if not removed and not problems:
         raise StoreError(
             f"nothing in {store.root} matches {' or '.join(given.patterns)} (keys, stages and sequences as "
             "in extrags cache ls); nothing was removed"
         )
-    for key in removed:
-        print(key)
     print(f"{counted(len(removed), 'artefact')} removed from {store.root}")
+    if problems:
+        more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+        raise StoreError(f"{problems[0]}{more}") from problems[0]
     return 0
 
 

@@ -92,6 +92,17 @@ def test_files_of_a_failure_that_cannot_be_removed_keep_no_others(
 
 
 @pytest.mark.usefixtures("untouched_environment")
+def test_what_cannot_be_removed_by_name_keeps_no_others(
+    store: Store, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["cache", "rm", "stays*", "goes*", "damaged*", "--store", store.root]) == 1
+    said = capsys.readouterr()
+    assert said.out.startswith("goes-v1-0\ndamaged-v1-0\n2 artefacts removed from ")
+    assert "stays-v1-0 cannot be removed" in said.err
+    assert store.keys() == ["stays-v1-0"]
+
+
+@pytest.mark.usefixtures("untouched_environment")
 def test_the_command_says_so_as_well(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["cache", "gc", "--older-than", "30d", "--store", store.root]) == 1
     said = capsys.readouterr()

@@ -76,6 +76,22 @@ def put(store: Store, key: str, place: str) -> None:
         pass
 
 
+@pytest.mark.usefixtures("untouched_environment")
+def test_an_ambiguous_name_leaves_what_is_named_before_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    store = Store(tmp_path / "store")
+    for place in ("a", "b"):
+        put(store, f"toy-v1-{place}", f"/{place}/scan")
+    assert main(["cache", "rm", "toy-v1-a", "scan", "--store", store.root]) == 1
+    assert "is in this store the name of /a/scan and /b/scan" in capsys.readouterr().err
+    assert store.keys() == ["toy-v1-a", "toy-v1-b"]
+    # Named twice, it goes once.
+    assert main(["cache", "rm", "toy-v1-a", "/a/scan", "--store", store.root]) == 0
+    assert "1 artefact removed" in capsys.readouterr().out
+
+
 class TestEarlierVersions:
     """Their manifests do not say where a sequence was."""
 
