@@ -129,8 +129,13 @@ class _SettingsSchema(_Shown):
 
 class _VariantsSchema(_Shown):
     def schema(self) -> JsonSchemaValue:
-        variant = settings_schema(further={"method": {"enum": list(get_args(MethodName))}})
-        return {"type": ["object", "null"], "additionalProperties": variant}
+        methods = list(get_args(MethodName))
+        return {
+            "type": ["object", "null"],
+            # Beside each other in tables, the two could not be told apart.
+            "propertyNames": {"not": {"enum": methods}},
+            "additionalProperties": settings_schema(further={"method": {"enum": methods}}),
+        }
 
 
 class _MatrixSchema(_Shown):

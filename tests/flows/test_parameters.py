@@ -144,6 +144,12 @@ class TestSchema:
         with pytest.raises(RefusedError, match="has non-unique elements"):
             submitted(name, **wrong)
 
+    @pytest.mark.parametrize("name", ["extrags", "uc-nerf"])
+    def test_variants_that_are_named_like_a_method(self, name: str) -> None:
+        submitted("benchmark", variants={f"{name}-dim": {"coarse.light.enabled": False}})
+        with pytest.raises(RefusedError, match=f"'{name}' should not be valid under .*'coarse'"):
+            submitted("benchmark", variants={name: {"coarse.light.enabled": False}})
+
     def test_none_is_no_list(self) -> None:
         submitted("dataset", seeds=None, methods=None, matrix=None)
 
