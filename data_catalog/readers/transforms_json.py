@@ -186,7 +186,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
 
 READER = FolderReader(
     name="transforms",
-    version=7,
+    version=8,
     summary=f"{TRANSFORMS_FILE} of nerfstudio or instant-ngp, or transforms_train.json and its like, "
     "described in data_catalog/readers/transforms_json.py",
     recognises=holds_transforms,

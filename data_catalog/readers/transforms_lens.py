@@ -82,6 +82,8 @@ class StatedLens:
                 f"camera_model {stated!r} beside is_fisheye; expected {_FISHEYE}, or no is_fisheye",
                 "camera_model",
             )
+        if stated == _FISHEYE and "camera_model" not in self.values:
+            self._check_fisheye_has_terms(named)
         model = _colmap_model(stated, named)
         parameters = LENS_PARAMETERS.get(model)
         if parameters is None or not set(parameters) <= set(named):
@@ -95,6 +97,20 @@ class StatedLens:
             return Lens(model, tuple(float(named[key]) for key in parameters), width, height)
         except SourceError as error:
             raise self._error(error.problem, error.field) from error
+
+    def _check_fisheye_has_terms(self, named: Mapping[str, float]) -> None:
+        """Refuse `is_fisheye` alone.
+
+        instant-ngp's `read_lens` (https://github.com/NVlabs/instant-ngp, src/nerf_loader.cu) reads a pinhole
+        where all terms are 0, whatever `is_fisheye` says; nerfstudio's reader of its files
+        (https://github.com/nerfstudio-project/nerfstudio/pull/1385) an equidistant fisheye.
+        """
+        if not any(named[key] for key in DISTORTION_KEYS):
+            raise self._error(
+                "is_fisheye without k1 to k4 is a pinhole for instant-ngp and an equidistant fisheye for "
+                f"nerfstudio; expected camera_model {_FISHEYE} or PINHOLE, or the terms of the lens",
+                "is_fisheye",
+            )
 
     def _size(self, image: Path) -> tuple[int, int]:
         """Width and height in pixels."""

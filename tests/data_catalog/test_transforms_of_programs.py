@@ -148,6 +148,17 @@ class TestCamerasOfInstantNgp:
             read(folder)
         assert caught.value.field == "camera_model"
 
+    @pytest.mark.parametrize("terms", [{}, {"k1": 0.0, "k2": 0, "k3": 0.0, "k4": None}])
+    def test_a_fisheye_without_terms(self, write, terms) -> None:
+        """A pinhole for instant-ngp, an equidistant fisheye for nerfstudio: `camera_model` decides."""
+        with pytest.raises(SourceError, match="a pinhole for instant-ngp") as caught:
+            read(write({**FOCAL, "is_fisheye": True, **terms}))
+        assert caught.value.field == "is_fisheye"
+        stated = {**FOCAL, "is_fisheye": True, "camera_model": "OPENCV_FISHEYE", **terms}
+        given = read(write(stated), IngestConfig(lens="native"))
+        assert given.lens.coefficients == pytest.approx((0, 0, 0, 0), abs=1e-9)
+        assert read(write({**FOCAL, "is_fisheye": False, **terms})).K[0, 0, 0] == pytest.approx(30)
+
 
 class TestFocalLengths:
     @pytest.mark.parametrize(
