@@ -7,12 +7,15 @@ principal point; what the lens did not
 see, or saw beyond the radius where its polynomial folds back, is left out of the validity mask.
 
 Source: COLMAP's camera models (https://colmap.github.io/cameras.html); Kannala and Brandt, "A generic camera
-model and calibration method for conventional, wide-angle and fish-eye lenses", PAMI 2006 (fisheye).
+model and calibration method for conventional, wide-angle and fish-eye lenses", PAMI 2006 (fisheye);
+Khomutenko, Garcia and Martinet, "An enhanced unified camera model", RA-L 2016 (EUCM); Fitzgibbon,
+"Simultaneous linear estimation of multiple view geometry and lens distortion", CVPR 2001 (division).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -48,8 +51,18 @@ LENS_PARAMETERS: dict[str, tuple[str, ...]] = {
     "SIMPLE_RADIAL_FISHEYE": ("f", "cx", "cy", "k1"),
     "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
     "THIN_PRISM_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1"),
+    "RAD_TAN_THIN_PRISM_FISHEYE": (
+        *("fx", "fy", "cx", "cy"),
+        *("k0", "k1", "k2", "k3", "k4", "k5"),
+        *("p0", "p1", "s0", "s1", "s2", "s3"),
+    ),
+    "SIMPLE_DIVISION": ("f", "cx", "cy", "k"),
+    "DIVISION": ("fx", "fy", "cx", "cy", "k"),
+    "SIMPLE_FISHEYE": ("f", "cx", "cy"),
+    "FISHEYE": ("fx", "fy", "cx", "cy"),
+    "EUCM": ("fx", "fy", "cx", "cy", "alpha", "beta"),
 }
-"""Every model understood here, with the names of its parameters in COLMAP's order."""
+"""Every model understood here, with the names of its parameters; both are in COLMAP's order."""
 
 _INTRINSIC_NAMES = frozenset({"f", "fx", "fy", "cx", "cy"})
 # Directions and radii in which a polynomial is searched for its fold.
@@ -170,6 +183,8 @@ class Lens:
         """Whether the linear part is all there is."""
         if self.model == "FOV" or self.model.endswith("FISHEYE"):
             return False
+        if self.model == "EUCM":
+            return self.value("alpha") == 0
         names = LENS_PARAMETERS[self.model]
         return all(
             value == 0
@@ -180,7 +195,7 @@ class Lens:
     def distorted(
         self, x: Float[np.ndarray, "*s"], y: Float[np.ndarray, "*s"]
     ) -> tuple[Float[np.ndarray, "*s"], Float[np.ndarray, "*s"]]:
-        """Normalised coordinates after the lens.
+        """Normalised coordinates after the lens; not a number where the model has none.
 
         Args:
             x: ray direction X / Z.
@@ -196,11 +211,25 @@ class Lens:
                 return x, y
             scale = np.where(r > 1e-9, np.arctan(2 * r * np.tan(omega / 2)) / (omega * safe), 1.0)
             return x * scale, y * scale
+        if self.model.endswith("DIVISION"):
+            # r = d / (1 + k d^2), solved for d; the other root lies beyond the fold.
+            with np.errstate(invalid="ignore"):
+                scale = 2 / (1 + np.sqrt(1 - 4 * self.value("k") * r * r))
+            return x * scale, y * scale
+        if self.model == "EUCM":
+            alpha = self.value("alpha")
+            with np.errstate(invalid="ignore", divide="ignore"):
+                scale = 1 / (alpha * np.sqrt(1 + self.value("beta") * r * r) + 1 - alpha)
+            # The projection needs a positive distance from the second centre.
+            scale = np.where(scale > 0, scale, np.nan)
+            return x * scale, y * scale
         if self.model.endswith("FISHEYE"):
             angle = np.arctan(r)
             turned = np.where(r > 1e-9, angle / safe, 1.0)
             x, y = x * turned, y * turned
         square = x * x + y * y
+        if self.model == "RAD_TAN_THIN_PRISM_FISHEYE":
+            return self._with_thin_prism(x, y, square)
         radial = 1 + square * (k1 + square * (k2 + square * (k3 + square * k4)))
         if self.model == "FULL_OPENCV":
             k5, k6 = self.value("k5"), self.value("k6")
@@ -212,10 +241,26 @@ class Lens:
             y * radial + 2 * p2 * x * y + p1 * (square + 2 * y * y) + self.value("sy1") * square,
         )
 
+    def _with_thin_prism(
+        self, x: Float[np.ndarray, "*s"], y: Float[np.ndarray, "*s"], square: Float[np.ndarray, "*s"]
+    ) -> tuple[Float[np.ndarray, "*s"], Float[np.ndarray, "*s"]]:
+        """Six radial terms, then tangential and prism ones of what these give."""
+        radial: Any = 0.0
+        for name in ("k5", "k4", "k3", "k2", "k1", "k0"):
+            radial = (radial + self.value(name)) * square
+        x, y = x * (1 + radial), y * (1 + radial)
+        square = x * x + y * y
+        p0, p1, s0, s1, s2, s3 = (self.value(name) for name in ("p0", "p1", "s0", "s1", "s2", "s3"))
+        both = 2 * (p0 * x + p1 * y)
+        return (
+            x + x * both + p0 * square + square * (s0 + s1 * square),
+            y + y * both + p1 * square + square * (s2 + s3 * square),
+        )
+
     def project(
         self, x: Float[np.ndarray, "*s"], y: Float[np.ndarray, "*s"]
     ) -> tuple[Float[np.ndarray, "*s"], Float[np.ndarray, "*s"]]:
-        """Pixel coordinates of rays (X / Z, Y / Z), centres at +0.5."""
+        """Pixel coordinates of rays (X / Z, Y / Z), centres at +0.5; not a number where there is none."""
         K = self.K
         moved_x, moved_y = self.distorted(x, y)
         return K[0, 0] * moved_x + K[0, 2], K[1, 1] * moved_y + K[1, 2]
@@ -238,8 +283,8 @@ class Undistortion:
 
     Args:
         K: of the pinhole.
-        u: column in the source of each pixel's ray, centres at +0.5.
-        v: row in the source.
+        u: column in the source of each pixel's ray, centres at +0.5; not a number where the lens has none.
+        v: row in the source, the same way.
         valid: whether the lens saw that ray.
     """
 
@@ -337,11 +382,12 @@ class Undistortion:
 
     def depth(self, depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h2 w2"]:
         """z-depth, never mixed across a fold; 0 where unknown."""
-        return np.where(self.valid, sample_depth(depth, self.u, self.v), 0).astype(np.float32)
+        u, v = np.where(self.valid, self.u, 0.0), np.where(self.valid, self.v, 0.0)
+        return np.where(self.valid, sample_depth(depth, u, v), 0).astype(np.float32)
 
     def _maps(self) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
-        # OpenCV counts from pixel centres.
-        return (self.u - 0.5).astype(np.float32), (self.v - 0.5).astype(np.float32)
+        # OpenCV counts from pixel centres, and nowhere is no place for it.
+        return np.nan_to_num(self.u - 0.5).astype(np.float32), np.nan_to_num(self.v - 0.5).astype(np.float32)
 
 
 def distortion_of_pinhole(

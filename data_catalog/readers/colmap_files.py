@@ -25,7 +25,8 @@ from extrags.lens import LENS_PARAMETERS, Lens
 
 __all__ = ["ColmapImage", "ColmapModel", "read_image_names", "read_model", "write_model"]
 
-_MODEL_NAMES = dict(enumerate(LENS_PARAMETERS))
+_PANORAMA = "EQUIRECTANGULAR"
+_MODEL_NAMES = dict(enumerate([*LENS_PARAMETERS, _PANORAMA]))
 """COLMAP numbers its models in this order."""
 _MODEL_IDS = {name: number for number, name in _MODEL_NAMES.items()}
 _NO_POINT = -1
@@ -253,6 +254,14 @@ def _binary_cameras(file: Path) -> dict[int, Lens]:
 
 
 def _lens(name: str, parameters: tuple[float, ...], width: int, height: int, file: Path, number: int) -> Lens:
+    if name == _PANORAMA:
+        raise SourceError(
+            f"the camera model {name} is a panorama, which shows what lies behind the camera too; expected "
+            "images of one direction, as COLMAP's scripts for panoramas render them",
+            file=file,
+            frame=f"camera {number}",
+            field="camera_model",
+        )
     try:
         return Lens(name, parameters, width, height)
     except SourceError as error:

@@ -23,6 +23,8 @@ FOCAL_KEYS = tuple(key for keys in _FOCAL_KEYS_OF_AXES for key in keys)
 _FTHETA_KEYS = tuple(f"ftheta_p{number}" for number in range(5))
 _OTHER_PROJECTIONS = ("latlong", "equirectangular", "orthographic")
 _FISHEYE = "OPENCV_FISHEYE"
+_MODELS = ("PINHOLE", "OPENCV", "FULL_OPENCV", _FISHEYE)
+"""To which `_colmap_model` leads, of those that these files can state."""
 _NERFSTUDIO_HAS_NOT = ("k4", "k5", "k6")
 """Its OPENCV is a polynomial of k1 to k4. COLMAP's has two terms, and the full one, which k3 needs, divides
 by k4 to k6."""
@@ -86,7 +88,7 @@ class StatedLens:
             self._check_fisheye_has_terms(named)
         model = _colmap_model(stated, named)
         parameters = LENS_PARAMETERS.get(model)
-        if parameters is None or not set(parameters) <= set(named):
+        if parameters is None or model not in _MODELS:
             raise self._error(
                 f"camera_model {model!r} is not understood; expected PINHOLE, SIMPLE_PINHOLE, SIMPLE_RADIAL, "
                 "RADIAL, OPENCV, FULL_OPENCV or OPENCV_FISHEYE",

@@ -151,6 +151,13 @@ def inverted(found: Any) -> Any:
 def unknown_camera_model(folder: Path) -> None:
     file = folder / "sparse" / "0" / "cameras.bin"
     content = bytearray(file.read_bytes())
+    content[12:16] = (99).to_bytes(4, "little")
+    file.write_bytes(bytes(content))
+
+
+def panorama(folder: Path) -> None:
+    file = folder / "sparse" / "0" / "cameras.bin"
+    content = bytearray(file.read_bytes())
     content[12:16] = (17).to_bytes(4, "little")
     file.write_bytes(bytes(content))
 

@@ -14,12 +14,17 @@ WIDTH, HEIGHT = 160, 128
 DISTORTION = {
     "k1": -0.12, "k2": 0.03, "k3": 0.004, "k4": -0.002, "k5": 0.01, "k6": 0.002,
     "p1": 0.003, "p2": -0.002, "sx1": 0.002, "sy1": -0.003, "omega": 0.8,
+    "k": -0.2, "alpha": 0.6, "beta": 1.2,
+}  # fmt: skip
+WITH_THIN_PRISM = {
+    "k0": -0.12, "k1": 0.03, "k2": 0.004, "k3": -0.002, "k4": 0.001, "k5": 0.0005,
+    "p0": 0.003, "p1": -0.002, "s0": 0.002, "s1": -0.003, "s2": 0.001, "s3": 0.0015,
 }  # fmt: skip
 
 
 def lens_of(model: str) -> Lens:
     linear = {"f": 110.0, "fx": 110.0, "fy": 113.0, "cx": 83.5, "cy": 61.0}
-    values = {**linear, **DISTORTION}
+    values = {**linear, **(WITH_THIN_PRISM if model.startswith("RAD_TAN") else DISTORTION)}
     return Lens(model, tuple(values[name] for name in LENS_PARAMETERS[model]), WIDTH, HEIGHT)
 
 
@@ -35,7 +40,13 @@ def test_projection_is_colmaps(model) -> None:
     np.testing.assert_allclose(np.column_stack([u, v]), expected, atol=1e-9)
 
 
-@pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE", "FOV", "SIMPLE_RADIAL"])
+@pytest.mark.parametrize(
+    "model",
+    [
+        *("OPENCV", "OPENCV_FISHEYE", "FOV", "SIMPLE_RADIAL"),
+        *("EUCM", "DIVISION", "FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"),
+    ],
+)
 def test_resampling_error_is_below_a_tenth_of_a_pixel(model) -> None:
     """An image whose colour says its ray: what is read off after resampling is the ray of another pixel."""
     import pycolmap
@@ -55,6 +66,52 @@ def test_resampling_error_is_below_a_tenth_of_a_pixel(model) -> None:
         moved = cv2.remap(rays[..., axis].astype(np.float32), *plan._maps(), cv2.INTER_LINEAR)
         error_px = np.abs(moved - expected)[plan.valid] * plan.K[0, 0]
         assert error_px.max() < 0.1
+
+
+def test_models_have_colmaps_numbers() -> None:
+    import pycolmap
+
+    for number, model in enumerate(LENS_PARAMETERS):
+        assert int(getattr(pycolmap.CameraModelId, model)) == number
+        assert len(pycolmap.Camera.create_from_model_name(1, model, 1.0, 8, 8).params) == len(
+            LENS_PARAMETERS[model]
+        )
+    # What another version of COLMAP adds is to be read or refused by name, too.
+    assert set(pycolmap.CameraModelId.__members__) - set(LENS_PARAMETERS) == {
+        "INVALID",
+        "EQUIRECTANGULAR",
+    }
+
+
+def test_what_a_division_model_has_no_place_for_is_left_out() -> None:
+    """With k above 0 rays beyond 1 / (2 sqrt(k)) have no image, as pycolmap says."""
+    import pycolmap
+
+    lens = Lens("DIVISION", (60.0, 61.0, 83.5, 61.0, 0.3), WIDTH, HEIGHT)
+    camera = pycolmap.Camera(model=lens.model, width=WIDTH, height=HEIGHT, params=list(lens.parameters))
+    x, y = (axis.ravel() for axis in np.meshgrid(np.linspace(-1.5, 1.5, 31), np.linspace(-1.5, 1.5, 31)))
+    expected = camera.img_from_cam(np.column_stack([x, y, np.ones(len(x))]))
+    found = np.column_stack(lens.project(x, y))
+    np.testing.assert_array_equal(np.isnan(found), np.isnan(expected))
+    assert np.isnan(found).any()
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+    plan = Undistortion.planned(lens, 110.0)
+    assert 0.2 < plan.valid.mean() < 0.9
+    depth = plan.depth(np.full((HEIGHT, WIDTH), 3.0, np.float32))
+    np.testing.assert_array_equal(depth, np.where(plan.valid, np.float32(3), 0))
+    assert (plan.color(np.full((HEIGHT, WIDTH, 3), 9, np.uint8))[~plan.valid] == 0).all()
+
+
+@pytest.mark.parametrize("model", ["EUCM", "DIVISION", "FISHEYE", "SIMPLE_DIVISION", "SIMPLE_FISHEYE"])
+def test_symmetric_models_are_radial_lenses(model) -> None:
+    assert lens_of(model).radial().error_px < 1e-3
+
+
+def test_models_without_distortion_are_pinholes() -> None:
+    for model, last in (("EUCM", (0.0, 1.3)), ("DIVISION", (0.0,))):
+        assert Lens(model, (100.0, 100.0, 80.0, 64.0, *last), WIDTH, HEIGHT).is_pinhole
+    for model, last in (("EUCM", (0.5, 1.0)), ("DIVISION", (0.1,)), ("FISHEYE", ())):
+        assert not Lens(model, (100.0, 100.0, 80.0, 64.0, *last), WIDTH, HEIGHT).is_pinhole
 
 
 @pytest.mark.parametrize("model", sorted(LENS_PARAMETERS))
