@@ -243,7 +243,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
 
 READER = FolderReader(
     name="colmap",
-    version=7,
+    version=8,
     summary="a COLMAP model in sparse/0/ with images/, described in data_catalog/readers/colmap_model.py",
     recognises=_recognises,
     files=_files,
@@ -418,7 +418,8 @@ def _listed(file: Path, known: set[str]) -> set[str] | None:
 
     Args:
         file: with or without the mark that editors on Windows put at the beginning.
-        known: names in the model. Blanks about a name are left out, unless it has them there.
+        known: names in the model. Blanks about a name are left out, unless it has them there, and the
+            separators of Windows are those of this system.
     """
     if not file.is_file():
         return None
@@ -426,7 +427,15 @@ def _listed(file: Path, known: set[str]) -> set[str] | None:
         lines = file.read_text(encoding="utf-8-sig").split("\n")
     except UnicodeDecodeError as error:
         raise SourceError(f"not a text file: {error}", file=file, field="split") from error
-    return {line if line in known else line.strip() for line in lines} - {""}
+    by_slashes = {name.replace("\\", "/"): name for name in known}
+
+    def named(line: str) -> str:
+        for spelled in (line, line.strip()):
+            if spelled in known:
+                return spelled
+        return by_slashes.get(line.strip().replace("\\", "/"), line.strip())
+
+    return {named(line) for line in lines} - {""}
 
 
 def _tell_about_unposed(root: Path, posed: set[str]) -> None:

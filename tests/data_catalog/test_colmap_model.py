@@ -385,6 +385,18 @@ class TestModelsOfOtherPrograms:
         np.testing.assert_array_equal(found.depth_mm, expected.depth_mm)
         np.testing.assert_array_equal(found.recording, expected.recording)
 
+    @pytest.mark.parametrize("of_model", ["/", "\\"])
+    @pytest.mark.parametrize("of_lists", ["/", "\\"])
+    def test_lists_with_separators_of_windows(self, workspace, of_model, of_lists) -> None:
+        names = sorted(image.name for image in read_model(workspace / "sparse" / "0").images)
+        rename_images(workspace, lambda name: name.replace("/", of_model))
+        for which, listed in (("train", names[:3]), ("test", names[3:5])):
+            lines = [name.replace("/", of_lists) for name in listed]
+            (workspace / f"{which}_list.txt").write_text("\r\n".join(lines))
+        found = read(workspace)
+        assert len(found) == 5
+        assert found.test.tolist() == [3, 4]
+
     @pytest.mark.parametrize("binary", [True, False])
     def test_points_that_are_not_finite(self, clip, tmp_path, caplog, binary) -> None:
         points = np.arange(60.0).reshape(20, 3)
