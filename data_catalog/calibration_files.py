@@ -94,7 +94,13 @@ def read_calibration(
         SourceNotFoundError: no such file.
         SourceError: damaged, of an unknown kind, or for images of another proportion; names file and field.
     """
-    text = _text(file)
+    return _camera(_text(file), file, width, height, camera)
+
+
+def _camera(
+    text: str, file: Path, width: int, height: int, camera: StereoCamera | None
+) -> Lens | ScaramuzzaCamera:
+    """What `read_calibration` gives, of the content of a file."""
     if "#polynomial coefficients" in text:
         return _ocamcalib(text, file).scaled(width, height, file=file)
     if _is_kalibr(text):
@@ -134,11 +140,13 @@ def with_calibration_file(source: SourceFrames, file: Path) -> SourceFrames:
             f"ingest.calibration is {file.name}, but the source {source.pose_file.name} states its "
             f"intrinsics itself. {source.lens_stays}"
         )
+    # Once, so that all that is said and done is of the same content.
+    text = _text(file)
     lenses = {
-        lens: read_calibration(file, lens.width, lens.height, camera=source.stereo_camera)
+        lens: _camera(text, file, lens.width, lens.height, source.stereo_camera)
         for lens in dict.fromkeys(frame.lens for frame in source.frames)
     }
-    _tell_of_cameras(file, source.stereo_camera)
+    _tell_of_cameras(text, file, source.stereo_camera)
     if source.intrinsics != "guessed":
         stated, calibrated = next(iter(lenses.items()))
         logger.warning(
@@ -357,9 +365,8 @@ def _kalibr_name(cameras: Mapping[str, Any], camera: StereoCamera | None) -> str
     return "cam1" if camera == "right" and "cam1" in cameras else "cam0"
 
 
-def _tell_of_cameras(file: Path, camera: StereoCamera | None) -> None:
+def _tell_of_cameras(text: str, file: Path, camera: StereoCamera | None) -> None:
     """Say which camera of a file with several was taken."""
-    text = _text(file)
     cameras = _kalibr_cameras(text, file) if _is_kalibr(text) else {}
     if len(cameras) < 2:
         return

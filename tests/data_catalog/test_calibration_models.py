@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -120,7 +121,7 @@ class TestSeveralCameras:
         assert read_calibration(file, WIDTH, HEIGHT, camera="right").K[0, 0] == 110  # type: ignore[union-attr]
 
     @pytest.mark.parametrize("camera", ["left", "right", None])
-    def test_of_a_source(self, tmp_path, camchain, caplog, camera) -> None:
+    def test_of_a_source(self, tmp_path, monkeypatch, camchain, caplog, camera) -> None:
         wide = np.random.default_rng(0).integers(40, 255, (HEIGHT, WIDTH + 20, 3)).astype(np.uint8)
         places = {"frames": 0} if camera is None else {"left": 6, "right": 0}
         for name, column in places.items():
@@ -130,8 +131,16 @@ class TestSeveralCameras:
                 image = Image.fromarray(np.ascontiguousarray(wide[:, at : at + WIDTH]))
                 image.save(tmp_path / "source" / name / f"{number}.png")
         config = IngestConfig(calibration=str(camchain), stereo_camera=camera or "left")
+        usual, reads = Path.read_text, []
+
+        def read_text(file: Path, *given: Any, **more: Any) -> str:
+            reads.append(file)
+            return usual(file, *given, **more)
+
+        monkeypatch.setattr(Path, "read_text", read_text)
         with caplog.at_level("INFO"):
             found = read(tmp_path / "source" / ("frames" if camera is None else ""), config)
+        assert reads.count(camchain) == 1
         assert found.stereo_camera == camera
         assert found.K[0, 0, 0] == pytest.approx(120 if camera == "right" else 110)
         told = [record for record in caplog.records if " is taken" in record.message]
