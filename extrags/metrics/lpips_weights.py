@@ -47,6 +47,8 @@ BACKBONES: dict[LpipsNet, str] = {
 BACKBONES_URL = "https://download.pytorch.org/models/"
 _HEADS = (("lpips", "weights/v0.1"), ("torchmetrics", "functional/image/lpips_models"))
 """Packages that hold the heads of version 0.1, and their folder inside."""
+_State = tuple[int, int, int, int, int]
+"""Device, inode, size and times of change of content and inode, the latter of which no program sets back."""
 
 
 def find_weights(explicit: str | None = None, net: LpipsNet = "alex") -> tuple[Path, ...]:
@@ -173,14 +175,19 @@ def check_weights(files: tuple[Path, ...], net: LpipsNet) -> None:
     Raises:
         WeightsError: when a file is damaged, or does not hold this network.
     """
-    states = [file.stat() for file in files]
-    _check(files, net, tuple((state.st_size, state.st_mtime_ns) for state in states))
+    _check(files, net, tuple(map(_state, files)))
 
 
 @lru_cache(maxsize=8)
-def _check(files: tuple[Path, ...], net: LpipsNet, states: tuple[tuple[int, int], ...]) -> None:
-    """Read weights; sizes and times of change are part of the cache's key. What is raised is not kept."""
+def _check(files: tuple[Path, ...], net: LpipsNet, states: tuple[_State, ...]) -> None:
+    """Read weights; what is told of the files is part of the cache's key. What is raised is not kept."""
     read_weights(files, net)
+
+
+def _state(file: Path) -> _State:
+    """What the operating system tells of a file: size and time of change alone survive some copies."""
+    found = file.stat()
+    return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns
 
 
 def download_backbone(net: LpipsNet) -> Path:
@@ -219,8 +226,7 @@ def _digest_prefix(file: Path) -> str:
 
 
 def _check_digest(file: Path) -> None:
-    state = file.stat()
-    if not _sha256(file, state.st_size, state.st_mtime_ns).startswith(_digest_prefix(file)):
+    if not _sha256(file, _state(file)).startswith(_digest_prefix(file)):
         raise WeightsError(
             f"{file}: its SHA-256 does not begin with {_digest_prefix(file)}, as its name says; remove it "
             "and download it again (extrags weights lpips --download)"
@@ -228,8 +234,8 @@ def _check_digest(file: Path) -> None:
 
 
 @lru_cache(maxsize=8)
-def _sha256(file: Path, size: int, changed_ns: int) -> str:
-    """Digest of a file; size and time of change are part of the cache's key."""
+def _sha256(file: Path, state: _State) -> str:
+    """Digest of a file; what is told of it is part of the cache's key."""
     with file.open("rb") as opened:
         return hashlib.file_digest(opened, "sha256").hexdigest()
 

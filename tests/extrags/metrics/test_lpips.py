@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 from pathlib import Path
 
@@ -209,6 +210,18 @@ def test_arrays_of_other_shapes_are_refused(tmp_path: Path, name: str, shape: tu
     check_weights((file,), "alex")
     np.savez(file, **{**weights, name: np.zeros(shape, np.float32)})
     with pytest.raises(WeightsError, match=rf"mine\.npz: .*; {name} has the shape {re.escape(str(shape))}"):
+        check_weights((file,), "alex")
+
+
+def test_weights_that_are_exchanged_with_their_times_are_checked_again(tmp_path: Path) -> None:
+    """As a copy that keeps size and time of change does."""
+    file = tmp_path / "mine.npz"
+    np.savez(file, **{key: value.numpy() for key, value in random_weights("alex").items()})
+    check_weights((file,), "alex")
+    before = file.stat()
+    file.write_bytes(bytes(before.st_size))
+    os.utime(file, ns=(before.st_atime_ns, before.st_mtime_ns))
+    with pytest.raises(WeightsError, match="not a readable npz"):
         check_weights((file,), "alex")
 
 
