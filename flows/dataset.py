@@ -151,12 +151,18 @@ def reconstruct_dataset(
             check_server(lost)
         return outcome
 
+    passed: list[SequenceOutcome] = []
+
     def run_all() -> DatasetOutcome:
         page.restart()
         if at_once == 1:
             outcomes = [reconstruct(case) for case in cases]
         else:
             outcomes = _side_by_side(reconstruct, expected, at_once)
+        # Where the page met damage, all but that is found in the store now.
+        for earlier, outcome in zip(passed, outcomes, strict=False):
+            outcome.add_time_of(earlier)
+        passed[:] = outcomes
         report = None
         if until == "report":
             label = profile_label(profile, method if methods is None else ", ".join(methods))

@@ -126,6 +126,21 @@ class SequenceOutcome:
         """The row of a stage, if it has one."""
         return next((row for row in self.stages if row.stage == stage), None)
 
+    def add_time_of(self, earlier: SequenceOutcome) -> None:
+        """Count what an earlier pass of the same run took, whose artefacts this one has found in the store.
+
+        A stage that was run then was run, and is not cached, for the run as a whole.
+        """
+        self.seconds += earlier.seconds
+        for before in earlier.stages:
+            row = self.row(before.stage)
+            if row is None:
+                continue
+            row.seconds += before.seconds
+            row.spent_seconds += before.spent_seconds
+            if (before.state, row.state) == ("ran", "cached"):
+                row.state = "ran"
+
     def to_json(self) -> dict[str, Any]:
         """A JSON object; keys as in docs/json.md."""
         return {

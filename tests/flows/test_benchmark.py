@@ -11,8 +11,9 @@ from typing import Any
 import pytest
 from prefect.artifacts import Artifact
 
+import flows.benchmark
 from extrags.config import profile_config
-from extrags.errors import ConfigError
+from extrags.errors import ArtefactGoneError, ConfigError
 from extrags.metrics.registry import PROTOCOL_VERSION
 from extrags.store import Store
 from flows.benchmark import Case, benchmark, check_methods, run_method, summary_of
@@ -188,6 +189,25 @@ class TestAgain:
         assert Path(found["report"]).is_file()
         (aside,) = (tmp_path / "damaged").iterdir()
         assert aside.name.startswith(key)
+
+    def test_what_was_spent_before_its_page_met_damage_counts(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        build, pages = flows.benchmark.benchmark_page, []
+
+        def page(*given: Any) -> str:
+            pages.append(given)
+            if len(pages) == 1:
+                raise ArtefactGoneError("it was removed meanwhile", "evaluate-v1-00")
+            return build(*given)
+
+        monkeypatch.setattr(flows.benchmark, "benchmark_page", page)
+        settings = {**TINY, "coarse.iterations": 20}
+        found = benchmark(sequences=[SEQUENCE], methods=["coarse"], settings=settings, store=str(tmp_path))
+        (case,) = found["cases"]
+        assert len(pages) == 2
+        assert case["spent_seconds"] == pytest.approx(case["seconds"], abs=2e-3)
+        assert case["spent_seconds"] > 0
 
     def test_a_wrong_setting_stops_it_at_once(self, tmp_path: Path) -> None:
         with pytest.raises(ConfigError, match=r"did you mean coarse\.iterations"):

@@ -257,6 +257,13 @@ def test_a_dataset_makes_each_stage_anew_once(tmp_path: Path, monkeypatch: pytes
     assert len(pages) == 2
     assert len(set(made)) == len(made) > 8
     assert sum(key.startswith("ingest-") for key in made) == 1
+    # Made in the first pass, found in the second: of the run they are made.
+    for outcome in found.sequences:
+        coarse = outcome.row("coarse")
+        assert coarse is not None
+        assert coarse.state == "ran"
+        assert coarse.spent_seconds == pytest.approx(coarse.made_seconds)
+        assert outcome.seconds > coarse.spent_seconds > 0
 
 
 @pytest.mark.parametrize("inner", [False, True])
