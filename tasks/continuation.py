@@ -113,7 +113,8 @@ def made_before(
         frames: the run's training frames.
         config: settings of the reconstruction.
         device: where it is optimised.
-        refresh: whether they will be made anew, which those cannot be whose start has been removed.
+        refresh: whether they will be made anew, which those cannot be whose start has been removed, or is
+            another one since it was made anew itself.
 
     Yields:
         The scene each went on from, and the number of iterations.
@@ -125,8 +126,10 @@ def made_before(
         if _settings(manifest) != config or given.get("device") != device:
             continue
         key = manifest.input_keys["earlier"]
-        if refresh and found_whole(store, key) is None:
-            continue
+        if refresh:
+            start = found_whole(store, key)
+            if start is None or start.digest != manifest.inputs["earlier"]:
+                continue
         scene = Ref(uri=store.backend.uri(key), digest=manifest.inputs["earlier"])
         yield Earlier(scene, key, [int(place) for place in given["frames"]]), int(given["iterations"])
 

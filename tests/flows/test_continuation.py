@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import tasks.coarse
 from extrags.config import CoarseConfig
 from extrags.errors import ConfigError
-from extrags.store import Manifest, Ref, Store
+from extrags.store import Manifest, Ref, Slot, Store
 from extrags.store.retention import Policy, planned_removals
 from flows.outcome import SequenceOutcome, StageRow
 from flows.runners import DirectRunner, StoreRunner
@@ -126,6 +127,39 @@ def test_a_repeated_run_finds_its_own_whatever_has_come_or_gone(folder: Path, st
     renewed = run_sequence(str(folder), config, store, runner, until="coarse")
     assert renewed.error is None
     assert made(renewed, store).counts["continued_frames"] == 5
+
+
+def test_made_anew_it_goes_on_from_its_start_as_that_is_now(
+    folder: Path, store: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Never from the scene of the same frames, which it replaces."""
+
+    def renewed() -> SequenceOutcome:
+        runner = DirectRunner(store, refresh=True)
+        return run_sequence(str(folder), tiny_config(**SETTINGS), store, runner, until="coarse")
+
+    first = run(folder, store)
+    grow(folder, 8)
+    second = run(folder, store)
+    assert renewed().refs["coarse"] == second.refs["coarse"]
+    # The start is made anew, and is not the same, as on another number of threads.
+    grow(folder, 5)
+    usual = tasks.coarse.save_reconstruction
+
+    def otherwise(slot: Slot, *given: Any) -> None:
+        usual(slot, *given)
+        slot.save_json("other.json", {})
+
+    with monkeypatch.context() as patched:
+        patched.setattr(tasks.coarse, "save_reconstruction", otherwise)
+        other = renewed()
+    assert other.refs["coarse"].digest != first.refs["coarse"].digest
+    grow(folder, 8)
+    again = renewed()
+    assert again.error is None
+    manifest = made(again, store)
+    assert manifest.inputs["earlier"] == other.refs["coarse"].digest
+    assert manifest.counts["continued_frames"] == 3
 
 
 def test_the_one_that_shares_most_frames_is_taken(folder: Path, store: str) -> None:
