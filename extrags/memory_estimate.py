@@ -13,7 +13,7 @@ from bisect import bisect_left
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 
-from extrags.config import PipelineConfig
+from extrags.config import PipelineConfig, UcNerfConfig
 from extrags.frame_stacks import MAPPED_BYTES
 from extrags.stages import StageName, stages_until
 
@@ -65,6 +65,19 @@ RENDERED_VIEW = 24
 FUSED_STACKS = (4, 4, 4, 4)
 """Bytes per pixel of the stacks of rendered training views: depth, and what is made of it to be fused."""
 PIXELS_MEASURED_AT_ONCE = 400_000
+UC_NERF_STEP = 90_000_000
+UC_NERF_RENDER = 170_000_000
+"""Bytes of a step of the baseline, and of rendering a view of it, beside what depends on settings."""
+UC_NERF_CELL, UC_NERF_RENDERED_CELL = 1500, 400
+"""Bytes per cell of its cost volumes, with gradients and without."""
+UC_NERF_SAMPLE = 1600
+"""Bytes per sample of a step's rays and source view."""
+UC_NERF_RENDERED_SAMPLE = 2_800_000
+"""Bytes per sample of a ray and source view, for as many rays as are rendered at once."""
+UC_NERF_FRAME, UC_NERF_ENCODED_FRAME = 18, 60
+"""Bytes per pixel of a training frame, while it is trained and while views are rendered from its features."""
+UC_NERF_VIEW = 720
+"""Bytes per pixel of the view that is rendered."""
 SMALLEST_WIDTH = 32
 STEPS = {"enhance.max_width": 16, "enhance.max_views": 8, "ingest.width": 16}
 """What settings are multiples of when they are named: an estimate is no finer."""
@@ -191,6 +204,9 @@ def estimate_memory(
         "evaluate": whole + max(stacks * rendered + metrics, rendered + restored),
         "report": whole + 2 * rendered,
     }
+    if config.uc_nerf.enabled:
+        trained, shown = _uc_nerf(config.uc_nerf, size)
+        found |= {"coarse": held + trained, "evaluate": whole + rendered + max(metrics, shown)}
     wanted = [stage for stage in stages_until(until) if stage not in leave_out]
     return MemoryEstimate({stage: round(found[stage]) for stage in wanted if stage in found})
 
@@ -198,6 +214,26 @@ def estimate_memory(
 def _held(stacks: Collection[int], pixels: int) -> int:
     """Bytes in memory of stacks of so many pixels in all, of which larger ones are mapped files."""
     return sum(min(size * pixels, MAPPED_BYTES) for size in stacks)
+
+
+def _uc_nerf(given: UcNerfConfig, size: FrameSize) -> tuple[int, int]:
+    """Bytes that the baseline takes while it is trained, and while a view of it is rendered."""
+    pixels = size.width * size.height
+    height = max(1, round(given.stereo_width * size.height / size.width))
+    # The fine volume has twice the width and the height of the coarse one.
+    cells = given.stereo_width * height * (given.coarse_planes + 4 * given.fine_planes)
+    samples = given.source_views * (given.samples_uniform + given.samples_prior)
+    rays = given.rays + given.patches * given.patch_px**2 + given.sparse_pixels
+    frames = size.training_frames * pixels
+    trained = UC_NERF_STEP + UC_NERF_CELL * cells + UC_NERF_SAMPLE * samples * rays + UC_NERF_FRAME * frames
+    shown = (
+        UC_NERF_RENDER
+        + UC_NERF_RENDERED_CELL * cells
+        + UC_NERF_RENDERED_SAMPLE * samples
+        + UC_NERF_ENCODED_FRAME * frames
+        + UC_NERF_VIEW * pixels
+    )
+    return trained, shown
 
 
 def _pairs(config: PipelineConfig, training_frames: int) -> int:

@@ -6,12 +6,13 @@ from dataclasses import replace
 
 import pytest
 
-from extrags.config import PROFILES, profile_config
+from extrags.config import PROFILES, UcNerfConfig, profile_config
 from extrags.memory_estimate import (
     CLIP_VIEWS,
     COMPARED_WIDTH,
     STEPS,
     FrameSize,
+    _uc_nerf,
     estimate_memory,
     fitting_settings,
 )
@@ -73,6 +74,39 @@ class TestEstimate:
             assert estimate_memory(config, size).peak_bytes > usual
         for name, value in (("enhance.max_width", None), ("enhance.max_views", 2000)):
             assert estimate_memory(config.with_overrides({name: value}), FULL).peak_bytes > usual
+
+    @pytest.mark.parametrize(
+        ("changes", "size", "trained_mib", "rendered_mib"),
+        [
+            ({}, (14, 320, 256), 253, 493),
+            ({}, (56, 320, 256), 313, 683),
+            ({}, (14, 640, 512), 335, 851),
+            ({"stereo_width": 80}, (14, 320, 256), 520, 571),
+            ({"coarse_planes": 96}, (14, 320, 256), 384, 501),
+            ({"source_views": 8}, (14, 320, 256), 334, 691),
+            ({"width": 128}, (14, 320, 256), 260, 460),
+            ({"samples_prior": 52}, (14, 320, 256), 401, 918),
+            ({"rays": 1024, "patches": 32}, (14, 320, 256), 445, 532),
+        ],
+    )
+    def test_covers_the_field_of_uc_nerf(
+        self, changes: dict[str, int], size: tuple[int, int, int], trained_mib: float, rendered_mib: float
+    ) -> None:
+        """What training and the rendering of a view took on one thread, beside the sequence."""
+        train, width, height = size
+        trained, shown = _uc_nerf(UcNerfConfig(**changes), FrameSize(train + 2, train, width, height))
+        assert 0.97 < trained / (trained_mib * 2**20) < 1.25
+        assert 0.97 < shown / (rendered_mib * 2**20) < 1.25
+
+    def test_of_uc_nerf_no_gaussians_count(self) -> None:
+        config = profile_config("quick").with_overrides({"uc_nerf.enabled": True})
+        found = estimate_memory(config, FULL)
+        more = config.with_overrides({"coarse.max_points": 10_000_000, "uc_nerf.samples_prior": 200})
+        larger = estimate_memory(more, FULL)
+        grown = {stage for stage in found.by_stage if larger.by_stage[stage] > found.by_stage[stage]}
+        assert "coarse" in grown
+        assert larger.by_stage["coarse"] < 2 * found.by_stage["coarse"]
+        assert larger.by_stage["evaluate"] > found.by_stage["evaluate"]
 
     def test_the_surface_is_fused_at_the_width_of_its_setting(self) -> None:
         config, size = profile_config("quick"), FrameSize(100, 80, 1350, 1080)
