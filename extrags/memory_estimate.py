@@ -66,17 +66,19 @@ FUSED_STACKS = (4, 4, 4, 4)
 """Bytes per pixel of the stacks of rendered training views: depth, and what is made of it to be fused."""
 PIXELS_MEASURED_AT_ONCE = 400_000
 UC_NERF_STEP = 90_000_000
-UC_NERF_RENDER = 170_000_000
+UC_NERF_RENDER = 165_000_000
 """Bytes of a step of the baseline, and of rendering a view of it, beside what depends on settings."""
-UC_NERF_CELL, UC_NERF_RENDERED_CELL = 1500, 400
-"""Bytes per cell of its cost volumes, with gradients and without."""
+UC_NERF_CELL = 1500
+"""Bytes per cell of its cost volumes, with gradients; without them they take little."""
 UC_NERF_SAMPLE = 1600
 """Bytes per sample of a step's rays and source view."""
 UC_NERF_RENDERED_SAMPLE = 2_800_000
 """Bytes per sample of a ray and source view, for as many rays as are rendered at once."""
-UC_NERF_FRAME, UC_NERF_ENCODED_FRAME = 18, 60
-"""Bytes per pixel of a training frame, while it is trained and while views are rendered from its features."""
-UC_NERF_VIEW = 720
+UC_NERF_FRAME = 18
+"""Bytes per pixel of a training frame."""
+UC_NERF_FEATURES = 450
+"""Bytes per pixel of both levels of the features of a training frame, from which views are rendered."""
+UC_NERF_VIEW = 1280
 """Bytes per pixel of the view that is rendered."""
 SMALLEST_WIDTH = 32
 STEPS = {"enhance.max_width": 16, "enhance.max_views": 8, "ingest.width": 16}
@@ -221,16 +223,17 @@ def _uc_nerf(given: UcNerfConfig, size: FrameSize) -> tuple[int, int]:
     pixels = size.width * size.height
     height = max(1, round(given.stereo_width * size.height / size.width))
     # The fine volume has twice the width and the height of the coarse one.
-    cells = given.stereo_width * height * (given.coarse_planes + 4 * given.fine_planes)
+    level = given.stereo_width * height
+    cells = level * (given.coarse_planes + 4 * given.fine_planes)
     samples = given.source_views * (given.samples_uniform + given.samples_prior)
     rays = given.rays + given.patches * given.patch_px**2 + given.sparse_pixels
     frames = size.training_frames * pixels
     trained = UC_NERF_STEP + UC_NERF_CELL * cells + UC_NERF_SAMPLE * samples * rays + UC_NERF_FRAME * frames
     shown = (
         UC_NERF_RENDER
-        + UC_NERF_RENDERED_CELL * cells
         + UC_NERF_RENDERED_SAMPLE * samples
-        + UC_NERF_ENCODED_FRAME * frames
+        + UC_NERF_FRAME * frames
+        + UC_NERF_FEATURES * size.training_frames * 5 * level
         + UC_NERF_VIEW * pixels
     )
     return trained, shown
