@@ -14,6 +14,7 @@ import logging
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
 from itertools import product
 from multiprocessing import get_context
@@ -36,6 +37,7 @@ __all__ = ["FORMAT", "Cell", "cells_of", "content_of", "in_own_process", "run_ce
 log = logging.getLogger(__name__)
 
 FORMAT = "extrags-pipeline-grid-1"
+DIED = "the process of this cell died, perhaps for lack of memory"
 
 
 @dataclass(frozen=True)
@@ -199,7 +201,12 @@ def run_grid(
         where = f"{cell.sequence}, {cell.method}, {cell.profile}, {cell.budget}, seed {cell.seed}"
         log.info("cell %d of %d: %s", number, len(cells), where)
         store = folder / "stores" / (name if separate else f"repeat-{cell.repeat}")
-        case = run(cell, str(store.absolute()))
+        try:
+            case = run(cell, str(store.absolute()))
+        except BrokenProcessPool:
+            # The other cells go on: the same command would meet the same end at the same place.
+            log.warning("%s: %s", where, DIED)
+            case = _case_of(cell, error=DIED)
         if not case["error"]:
             # A cell that failed is tried again by the same command.
             _write(file, case)
@@ -256,29 +263,20 @@ def run_cell(cell: Cell, store: str) -> dict[str, Any]:
     counted = [row for row in ran if row.stage not in NOT_COUNTED]
     processor = [row.processor_seconds for row in counted]
     peaks = [row.peak_mib for row in counted if row.peak_mib is not None]
-    name, _, setting = cell.sequence.partition("@")
     failed = next((row for row in outcome.stages if row.state == "failed"), None)
     # Where poses are estimated or refined, the sequence is theirs, and does not count its pixels.
     read = outcome.refs.get("ingest")
     counts = {} if read is None else Store(store).manifest(read).counts
-    return {
-        "method": cell.method,
-        "profile": cell.profile,
-        "budget": cell.budget,
-        "changed": cell.changed,
-        "sequence": name,
-        "setting": setting or None,
-        "seed": cell.seed,
-        "repeat": cell.repeat,
+    return _case_of(
+        cell,
         **{key: counts.get(key) for key in ("width", "height", "frames")},
-        "seconds": round(sum(row.made_seconds for row in counted), 3),
-        "processor_seconds": None
+        seconds=round(sum(row.made_seconds for row in counted), 3),
+        processor_seconds=None
         if None in processor
         else round(sum(value for value in processor if value is not None), 3),
-        "peak_mib": max(peaks) if peaks else None,
-        "shared_seconds": round(sum(map(_shared_seconds, counted)), 3),
-        "load_average": round(os.getloadavg()[0], 2),
-        "stages": [
+        peak_mib=max(peaks) if peaks else None,
+        shared_seconds=round(sum(map(_shared_seconds, counted)), 3),
+        stages=[
             {
                 "stage": row.stage,
                 "state": row.state,
@@ -289,8 +287,32 @@ def run_cell(cell: Cell, store: str) -> dict[str, Any]:
             }
             for row in ran
         ],
-        "metrics": outcome.metrics["final"] if failed is None else None,
-        "error": "" if failed is None else f"{failed.stage}: {failed.reason}",
+        metrics=outcome.metrics["final"] if failed is None else None,
+        error="" if failed is None else f"{failed.stage}: {failed.reason}",
+    )
+
+
+def _case_of(cell: Cell, **found: Any) -> dict[str, Any]:
+    """The JSON of a case: what the cell is, and what was found; the rest is unknown."""
+    name, _, setting = cell.sequence.partition("@")
+    return {
+        "method": cell.method,
+        "profile": cell.profile,
+        "budget": cell.budget,
+        "changed": cell.changed,
+        "sequence": name,
+        "setting": setting or None,
+        "seed": cell.seed,
+        "repeat": cell.repeat,
+        **dict.fromkeys(("width", "height", "frames")),
+        "seconds": 0.0,
+        "processor_seconds": None,
+        "peak_mib": None,
+        "shared_seconds": 0.0,
+        "load_average": round(os.getloadavg()[0], 2),
+        "stages": [],
+        "metrics": None,
+        **found,
     }
 
 

@@ -179,7 +179,7 @@ def grid_markdown(found: dict[str, Any]) -> str:
     lines += [""] * bool(failed)
     for case in failed:
         what = f"{_name(case)}, {case['method']}, {case['profile']}, {case['budget']}, seed {case['seed']}"
-        lines.append(f"* {what} failed in {case['error']}")
+        lines.append(f"* {what} failed: {case['error']}")
     return "\n".join(lines) + "\n"
 
 

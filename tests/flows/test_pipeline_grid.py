@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +20,7 @@ from extrags.restoration.diffusion.weights import COLONS, starting_weights
 from flows.budgets import Budget
 from flows.cli import main
 from flows.commands.bench_pipeline import grid_markdown
-from flows.pipeline_grid import Cell, cells_of, run_cell, run_grid
+from flows.pipeline_grid import DIED, Cell, cells_of, run_cell, run_grid
 from flows.selection import Chosen
 from tests.documented_json import undocumented
 from tests.flows.tiny import SEQUENCE, TINY
@@ -106,6 +109,24 @@ class TestGrid:
         tried = []
         run_grid(cells(), tmp_path, run=lambda cell, _: tried.append(cell) or _case(cell))
         assert len(tried) == 2
+
+    def test_a_cell_whose_process_dies_has_failed_and_the_others_go_on(self, tmp_path: Path) -> None:
+        def run(cell: Cell, store: str) -> dict[str, Any]:
+            if cell.changed == {"coarse.iterations": 10}:
+                with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+                    pool.submit(os._exit, 9).result()
+            return _case(cell)
+
+        found = run_grid(cells(), tmp_path, run=run)
+        assert [case["error"] for case in found["cases"]] == [DIED, ""]
+        assert [cell["runs"] for cell in found["cells"]] == [0, 1]
+        table = grid_markdown(found)
+        assert f"coarse, quick, coarse.iterations=10, seed 0 failed: {DIED}\n" in table
+        assert not undocumented(found["cases"][0], "a-case-of-a-grid")
+        # It is tried again by the same command.
+        tried: list[Cell] = []
+        run_grid(cells(), tmp_path, run=lambda cell, _: tried.append(cell) or _case(cell))
+        assert [cell.changed for cell in tried] == [{"coarse.iterations": 10}]
 
     def test_what_reads_changed_files_is_measured_anew(self, tmp_path: Path) -> None:
         source, scene = tmp_path / "source", tmp_path / "theirs.ply"
@@ -207,7 +228,7 @@ def test_the_table_says_what_failed(tmp_path: Path) -> None:
     assert "| phantom/0@sparse | - | coarse | quick |" in table
     assert "0 (1 failed)" in table
     assert "* phantom/0@sparse, coarse, quick, " in table
-    assert table.count("seed 0 failed in ingest: no such file\n") == 2
+    assert table.count("seed 0 failed: ingest: no such file\n") == 2
     fine = run_grid(cells(), tmp_path / "fine", run=lambda cell, _: _case(cell))
     assert "failed" not in grid_markdown(fine)
 
