@@ -37,6 +37,8 @@ __all__ = ["FORMAT", "Cell", "cells_of", "content_of", "in_own_process", "run_ce
 log = logging.getLogger(__name__)
 
 FORMAT = "extrags-pipeline-grid-1"
+_RESOLVED = dict.fromkeys(("budget", "changed", "settings"))
+"""What of a cell its settings, all of them together, stand for."""
 DIED = "the process of this cell died, perhaps for lack of memory"
 
 
@@ -83,7 +85,8 @@ class Cell:
 def cells_of(
     sequences: Sequence[Chosen],
     methods: Sequence[str],
-    budgets: Sequence[tuple[str, Sequence[Budget]]],
+    profiles: Sequence[str],
+    budgets_of: Callable[[PipelineConfig], Sequence[Budget]],
     seeds: Sequence[int],
     repeats: int,
     settings: dict[str, Any],
@@ -93,14 +96,16 @@ def cells_of(
     Args:
         sequences: names, with settings that a manifest gives them.
         methods: names.
-        budgets: of each profile.
+        profiles: names.
+        budgets_of: the budgets of a run with these settings, which are those of its profile, method and
+            sequence, and the overrides: parts and multiples are of what the run would have.
         seeds: of all stages.
         repeats: how often everything is measured, each time from an empty store.
         settings: overrides of all runs; those of a sequence come on top of them.
 
     Returns:
-        Cells without repetitions: a budget that changes only what a method leaves out is the method's
-        `profile` budget.
+        Cells without repetitions, the first of those with equal settings: a budget that changes only what a
+        method leaves out is the method's `profile` budget.
 
     Raises:
         ConfigError: for an unknown method or profile, or a setting that is wrong or that the method pins.
@@ -108,23 +113,22 @@ def cells_of(
     from flows.methods import METHODS, method_config, pinned_settings
 
     found: dict[str, Cell] = {}
-    for repeat, chosen, (profile, inside), seed, method in product(
-        range(repeats), sequences, budgets, seeds, methods
-    ):
+    for repeat, chosen, profile, seed, method in product(range(repeats), sequences, profiles, seeds, methods):
         if method not in METHODS:
             raise ConfigError(f"no method {method!r}; known: {', '.join(METHODS)}")
-        for budget in inside:
-            pinned = pinned_settings(method)
+        own = {**settings, **chosen.settings}
+        pinned = pinned_settings(method)
+        for budget in budgets_of(method_config(method, profile, own, seed)):
             changed = {
                 name: value
                 for name, value in reaching(budget, METHODS[method].leave_out).items()
                 if name not in pinned
             }
             name = ", ".join(f"{key}={value}" for key, value in changed.items()) or "profile"
-            own = {**settings, **chosen.settings}
-            method_config(method, profile, {**own, **changed}, seed)
             cell = Cell(chosen.name, method, profile, name, changed, own, seed, repeat)
-            found.setdefault(cell.key, cell)
+            # What is varied may have the value that the run has anyway.
+            resolved = cell.config().model_dump(mode="json")
+            found.setdefault(digest_of({**asdict(cell), **_RESOLVED, "config": resolved}), cell)
     return list(found.values())
 
 

@@ -26,7 +26,7 @@ EXAMPLES = """examples:
 
 --vary NAME=V,V      each value is a budget; several --vary are combined, every value with every other
 --vary A+B=1+2,3+4   settings that change together, with a value for each (or one for all of them)
---budgets PRESET     one thing at a time: iterations, gaussians, views (parts and multiples of the profile's),
+--budgets PRESET     one thing at a time: iterations, gaussians, views (parts and multiples of the run's),
                      size, steps, precision
 A budget reaches the methods that have the stage and do not pin the setting."""
 
@@ -56,7 +56,7 @@ def add_arguments(parser: Parser) -> None:
         nargs="+",
         default=[],
         metavar="PRESET",
-        help=f"of {', '.join((*PRESETS, *SET_PRESETS))}: see below (default: the profile's settings alone)",
+        help=f"of {', '.join((*PRESETS, *SET_PRESETS))}: see below (default: the run's settings alone)",
     )
     parser.add_argument(
         "--vary",
@@ -98,7 +98,6 @@ def pipeline(given: argparse.Namespace) -> int:
 
     folder = Path(given.output)
     prepare(folder.absolute() / "state", debug=given.debug)
-    from extrags.config import profile_config
     from extrags.report.fronts_plot import write_fronts_plot
     from flows.budgets import budgets_of, parsed_vary
     from flows.pipeline_grid import cells_of, run_grid
@@ -106,14 +105,12 @@ def pipeline(given: argparse.Namespace) -> int:
     from flows.selection import chosen_sequences
 
     vary = [parsed_vary(text) for text in given.vary]
-    budgets = [
-        (profile, budgets_of(profile_config(profile), items(given.budgets), vary))
-        for profile in items(given.profiles)
-    ]
+    presets = items(given.budgets)
     cells = cells_of(
         chosen_sequences(given.sequences),
         items(given.methods),
-        budgets,
+        items(given.profiles),
+        lambda config: budgets_of(config, presets, vary),
         parsed_seeds(given.seeds),
         given.repeats,
         given.settings or {},

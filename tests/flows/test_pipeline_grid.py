@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -14,10 +15,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from extrags.config import PipelineConfig, profile_config
 from extrags.errors import ConfigError
 from extrags.metrics.registry import PROTOCOL_VERSION
 from extrags.restoration.diffusion.weights import COLONS, starting_weights
-from flows.budgets import Budget
+from flows.budgets import Budget, budgets_of, parsed_vary
 from flows.cli import main
 from flows.commands.bench_pipeline import grid_markdown
 from flows.pipeline_grid import DIED, Cell, cells_of, run_cell, run_grid
@@ -29,25 +31,60 @@ SMALL = {**TINY, "ingest.max_frames": 8}
 BUDGETS = [Budget("few", {"coarse.iterations": 10}), Budget("more", {"coarse.iterations": 20})]
 
 
+def of(budgets: list[Budget]) -> Callable[[PipelineConfig], list[Budget]]:
+    """The same budgets, whatever the settings of a run."""
+    return lambda _: budgets
+
+
 def cells(repeats: int = 1, **settings: Any) -> list[Cell]:
     return cells_of(
-        [Chosen("phantom/0@sparse")], ["coarse"], [("quick", BUDGETS)], [0], repeats, {**SMALL, **settings}
+        [Chosen("phantom/0@sparse")], ["coarse"], ["quick"], of(BUDGETS), [0], repeats, {**SMALL, **settings}
     )
 
 
 class TestCells:
     def test_budgets_that_do_not_reach_a_method_are_one_cell(self) -> None:
         budgets = [Budget("a", {"finetune.iterations": 5}), Budget("b", {"finetune.iterations": 6})]
-        found = cells_of([Chosen(SEQUENCE)], ["coarse", "extrags"], [("quick", budgets)], [0], 1, {})
+        found = cells_of([Chosen(SEQUENCE)], ["coarse", "extrags"], ["quick"], of(budgets), [0], 1, {})
         assert [(cell.method, cell.budget) for cell in found] == [
             ("coarse", "profile"),
             ("extrags", "finetune.iterations=5"),
             ("extrags", "finetune.iterations=6"),
         ]
 
+    def test_a_preset_multiplies_what_the_run_would_have(self) -> None:
+        chosen = [Chosen(SEQUENCE), Chosen("phantom/1@sparse", {"coarse.iterations": 400})]
+        settings = {"coarse.iterations": 3000, "finetune.iterations": 600}
+        found = cells_of(
+            chosen,
+            ["extrags"],
+            ["quick"],
+            lambda config: budgets_of(config, ["iterations"], []),
+            [0],
+            1,
+            settings,
+        )
+        counts = [(cell.config().coarse.iterations, cell.config().finetune.iterations) for cell in found]
+        assert counts[:4] == [(750, 150), (1500, 300), (3000, 600), (6000, 1200)]
+        assert counts[4:] == [(100, 150), (200, 300), (400, 600), (800, 1200)]
+
+    def test_runs_of_equal_settings_are_one_cell(self) -> None:
+        own = profile_config("quick").coarse.iterations
+        vary = [parsed_vary(f"coarse.iterations={own},3000")]
+
+        def budgets(*presets: str) -> list[str]:
+            found = cells_of(
+                [Chosen(SEQUENCE)], ["coarse"], ["quick"], lambda c: budgets_of(c, presets, vary), [0], 1, {}
+            )
+            return [cell.budget for cell in found]
+
+        assert budgets() == [f"coarse.iterations={own}", "coarse.iterations=3000"]
+        # The profile's is there already, as that of the preset.
+        assert budgets("views") == ["profile", "coarse.iterations=3000"]
+
     def test_settings_of_a_manifest_hold_for_their_sequence(self) -> None:
         chosen = [Chosen(SEQUENCE, {"coarse.iterations": 77}), Chosen("phantom/1@sparse")]
-        found = cells_of(chosen, ["coarse"], [("quick", [Budget()])], [0], 1, {"coarse.max_points": 900})
+        found = cells_of(chosen, ["coarse"], ["quick"], of([Budget()]), [0], 1, {"coarse.max_points": 900})
         assert [cell.settings for cell in found] == [
             {"coarse.max_points": 900, "coarse.iterations": 77},
             {"coarse.max_points": 900},
@@ -58,13 +95,14 @@ class TestCells:
             cells_of(
                 [Chosen(SEQUENCE)],
                 ["coarse"],
-                [("quick", [Budget("x", {"coarse.iterations": -1})])],
+                ["quick"],
+                of([Budget("x", {"coarse.iterations": -1})]),
                 [0],
                 1,
                 {},
             )
         with pytest.raises(ConfigError, match="no method 'magic'"):
-            cells_of([Chosen(SEQUENCE)], ["magic"], [("quick", [Budget()])], [0], 1, {})
+            cells_of([Chosen(SEQUENCE)], ["magic"], ["quick"], of([Budget()]), [0], 1, {})
 
 
 class TestGrid:
@@ -142,7 +180,7 @@ class TestGrid:
         def measured(sequence: str, **settings: Any) -> int:
             ran.clear()
             given = {name.replace("__", "."): value for name, value in settings.items()}
-            found = cells_of([Chosen(sequence)], ["coarse"], [("quick", [Budget()])], [0], 1, given)
+            found = cells_of([Chosen(sequence)], ["coarse"], ["quick"], of([Budget()]), [0], 1, given)
             run_grid(found, tmp_path / "grid", run=run)
             return len(ran)
 
@@ -167,7 +205,7 @@ class TestGrid:
     def test_a_source_that_cannot_be_read_is_a_cell_that_fails(self, tmp_path: Path) -> None:
         (tmp_path / "empty").mkdir()
         found = cells_of(
-            [Chosen(str(tmp_path / "empty"))], ["coarse"], [("quick", [Budget()])], [0], 1, SMALL
+            [Chosen(str(tmp_path / "empty"))], ["coarse"], ["quick"], of([Budget()]), [0], 1, SMALL
         )
         (case,) = run_grid(found, tmp_path / "grid", run=run_cell)["cases"]
         assert "the folder is empty" in case["error"]
