@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import logging
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
@@ -39,6 +39,10 @@ log = logging.getLogger(__name__)
 FORMAT = "extrags-pipeline-grid-1"
 _RESOLVED = dict.fromkeys(("budget", "changed", "settings"))
 """What of a cell its settings, all of them together, stand for."""
+SHARING = (
+    "stages that cells of a repeat have in common were made once; every cell is charged their time. The "
+    "process that made them keeps what they took: memory depends on the order of cells, and is on no front"
+)
 DIED = "the process of this cell died, perhaps for lack of memory"
 
 
@@ -170,6 +174,7 @@ def run_grid(
     folder: Path,
     *,
     separate: bool = False,
+    settings: Mapping[str, Any] | None = None,
     run: Callable[[Cell, str], dict[str, Any]] | None = None,
 ) -> dict[str, Any]:
     """Run all cells that are not finished, and gather all.
@@ -178,11 +183,13 @@ def run_grid(
         cells: from `cells_of`.
         folder: of this grid: stores and finished cells.
         separate: give each cell a store of its own, so that nothing is shared.
+        settings: overrides of all runs, as `cells_of` was given them, for the result.
         run: what runs a cell; `in_own_process` by default.
 
     Returns:
-        `{format, machine, protocol, sharing, cases, cells, fronts}`; `cases` as of `run_cell`, `cells` their
-        means (`extrags.metrics.fronts.means_by_cell`), `fronts` as of `extrags.metrics.fronts.fronts`.
+        `{format, machine, protocol, settings, separate, sharing, cases, cells, fronts}`; `cases` as of
+        `run_cell`, `cells` their means (`extrags.metrics.fronts.means_by_cell`), `fronts` as of
+        `extrags.metrics.fronts.fronts`; none by memory where stages are shared.
 
     Raises:
         ConfigError: when the folder holds a grid of another machine, version or way of sharing.
@@ -220,12 +227,12 @@ def run_grid(
         "format": FORMAT,
         "machine": about,
         "protocol": PROTOCOL_VERSION,
-        "sharing": "none: a store for each cell"
-        if separate
-        else "stages that cells of a repeat have in common were made once; every cell is charged their time",
+        "settings": dict(settings or {}),
+        "separate": separate,
+        "sharing": "none: a store for each cell" if separate else SHARING,
         "cases": cases,
         "cells": means,
-        "fronts": fronts(means),
+        "fronts": [entry for entry in fronts(means) if separate or entry["cost"] != "peak_mib"],
     }
 
 
@@ -243,9 +250,9 @@ def run_cell(cell: Cell, store: str) -> dict[str, Any]:
     """Run a cell in this process; what fails is in the result, not raised.
 
     Returns:
-        `{method, profile, budget, changed, sequence, setting, seed, repeat, width, height, frames, seconds,
-        processor_seconds, peak_mib, shared_seconds, load_average, stages, metrics, error}`. Seconds are
-        those of all stages but evaluation, spent within this grid; `shared_seconds` the part of them that
+        `{method, profile, budget, changed, settings, sequence, setting, seed, repeat, width, height, frames,
+        seconds, processor_seconds, peak_mib, shared_seconds, load_average, stages, metrics, error}`. Seconds
+        are those of all stages but evaluation, spent within this grid; `shared_seconds` the part of them that
         was spent by a cell before. `stages` has `{stage, state, seconds, processor_seconds, peak_mib,
         shared_seconds}` of each, evaluation too.
     """
@@ -304,6 +311,7 @@ def _case_of(cell: Cell, **found: Any) -> dict[str, Any]:
         "profile": cell.profile,
         "budget": cell.budget,
         "changed": cell.changed,
+        "settings": cell.settings,
         "sequence": name,
         "setting": setting or None,
         "seed": cell.seed,

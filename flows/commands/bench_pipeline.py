@@ -72,7 +72,8 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument(
         "--separate",
         action="store_true",
-        help="do not share stages between runs (default: compute once, charge its time to each)",
+        help="do not share stages between runs (default: compute once, charge its time to each; memory "
+        "is then not compared)",
     )
     add_output(
         parser,
@@ -105,7 +106,7 @@ def pipeline(given: argparse.Namespace) -> int:
     from flows.selection import chosen_sequences
 
     vary = [parsed_vary(text) for text in given.vary]
-    presets = items(given.budgets)
+    presets, settings = items(given.budgets), given.settings or {}
     cells = cells_of(
         chosen_sequences(given.sequences),
         items(given.methods),
@@ -113,10 +114,10 @@ def pipeline(given: argparse.Namespace) -> int:
         lambda config: budgets_of(config, presets, vary),
         parsed_seeds(given.seeds),
         given.repeats,
-        given.settings or {},
+        settings,
     )
     _check_models(cells, preflight)
-    found = run_grid(cells, folder, separate=given.separate)
+    found = run_grid(cells, folder, separate=given.separate, settings=settings)
     text = json.dumps(found, indent=1)
     write_file(folder / "results.json", text)
     table = grid_markdown(found)
@@ -157,7 +158,8 @@ def grid_markdown(found: dict[str, Any]) -> str:
         if any(figure.name in cell["figures"] for cell in found["cells"])
     ]
     on = _front_members(found, [figure.name for figure in shown])
-    header = ["sequence", "size", "method", "profile", "budget", "runs", "s", "processor s", "MiB"]
+    header = ["sequence", "size", "method", "profile", "budget", "runs", "s", "processor s"]
+    header += ["MiB" if found["separate"] else "MiB*"]
     header += [figure.label for figure in shown]
     lines = [f"| {' | '.join(header)} |", f"|{'---|' * 5}{'---:|' * (len(header) - 5)}"]
     for cell in found["cells"]:
@@ -172,6 +174,9 @@ def grid_markdown(found: dict[str, Any]) -> str:
             row.append(f"**{text}**" if (*_identity(cell), figure.name) in on else text)
         lines.append(f"| {' | '.join(row)} |")
     lines += ["", "Bold: on the front of this figure against processor time, within its sequence and size."]
+    if not found["separate"]:
+        # Stages do not give back all that they took.
+        lines += ["", "*: depends on which run made what runs share; comparable with --separate alone."]
     failed = [case for case in found["cases"] if case["error"]]
     lines += [""] * bool(failed)
     for case in failed:

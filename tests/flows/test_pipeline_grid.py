@@ -140,6 +140,22 @@ class TestGrid:
         run_grid(cells(), tmp_path / "separate", separate=True, run=run)
         assert len(set(stores)) == 2
 
+    def test_memory_is_compared_where_nothing_is_shared(self, tmp_path: Path) -> None:
+        """The cell that makes what others share carries it on, whichever cell comes first."""
+        grids = {
+            separate: run_grid(
+                cells(), tmp_path / str(separate), separate=separate, run=lambda cell, _: _case(cell)
+            )
+            for separate in (False, True)
+        }
+        costs = {separate: {entry["cost"] for entry in found["fronts"]} for separate, found in grids.items()}
+        assert costs[False] == {"seconds", "processor_seconds"}
+        assert costs[True] == {"seconds", "processor_seconds", "peak_mib"}
+        assert "| MiB* |" in grid_markdown(grids[False])
+        assert "comparable with --separate alone" in grid_markdown(grids[False])
+        assert "| MiB |" in grid_markdown(grids[True])
+        assert "--separate" not in grid_markdown(grids[True])
+
     def test_failed_cells_are_tried_again(self, tmp_path: Path) -> None:
         run_grid(
             cells(), tmp_path, run=lambda cell, _: {**_case(cell), "error": "coarse: no", "metrics": None}
@@ -202,6 +218,17 @@ class TestGrid:
         record.write_text(record.read_text() + "\n")
         assert [measured(SEQUENCE, **own) for _ in range(2)] == [1, 0]
 
+    def test_results_say_what_was_run(self, tmp_path: Path) -> None:
+        chosen = [Chosen(str(tmp_path), {"coarse.max_points": 900})]
+        budgets = of([Budget("few", {"coarse.iterations": 10})])
+        found = cells_of(chosen, ["coarse"], ["quick"], budgets, [0], 1, SMALL)
+        result = run_grid(found, tmp_path / "grid", settings=SMALL, run=run_cell)
+        (case,) = result["cases"]
+        assert result["settings"] == SMALL
+        assert case["changed"] == {"coarse.iterations": 10}
+        assert case["settings"]["ingest.max_frames"] == 8
+        assert case["settings"]["coarse.max_points"] == 900
+
     def test_a_source_that_cannot_be_read_is_a_cell_that_fails(self, tmp_path: Path) -> None:
         (tmp_path / "empty").mkdir()
         found = cells_of(
@@ -244,7 +271,10 @@ def test_the_verbs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert (tmp_path / "fronts.png").stat().st_size > 1000
     result = tmp_path / "results.json"
     assert not undocumented(json.loads(result.read_text()), "bench-pipeline")
-    assert len(json.loads(result.read_text())["cases"]) == 1
+    (case,) = json.loads(result.read_text())["cases"]
+    assert case["changed"] == {"coarse.iterations": 5}
+    assert case["settings"] == json.loads(result.read_text())["settings"]
+    assert case["settings"]["ingest.max_frames"] == 8
     compared = tmp_path / "compared.json"
     assert main(["bench", "compare", str(result), str(result), "--json", str(compared)]) == 0
     assert json.loads(compared.read_text())["rows"]
