@@ -335,7 +335,9 @@ def _shared_seconds(row: StageRow) -> float:
 
 def _claim(folder: Path, about: dict[str, Any], separate: bool) -> None:
     """Times of one machine and one version stand in one folder."""
-    mine = {name: about[name] for name in (*SAME_MACHINE, "versions", "commit")} | {"separate": separate}
+    mine = {name: about[name] for name in (*SAME_MACHINE, "device", "versions", "commit")} | {
+        "separate": separate
+    }
     file = folder / "grid.json"
     if not file.exists():
         _write(file, mine)
