@@ -1,13 +1,15 @@
-"""How many cores this process may keep busy."""
+"""How many cores this process may keep busy, and what they are."""
 
 from __future__ import annotations
 
 import math
 import os
+import platform
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 
-__all__ = ["usable_cores"]
+__all__ = ["processor_name", "usable_cores"]
 
 CONTROL_GROUP = Path("/sys/fs/cgroup")
 """Where a container sees its own limits."""
@@ -18,6 +20,16 @@ def usable_cores() -> int:
     cores = len(os.sched_getaffinity(0))
     share = _quota()
     return cores if share is None else max(1, min(cores, math.ceil(share)))
+
+
+@cache
+def processor_name() -> str:
+    """The processor as the system names it; empty where it does not."""
+    with suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.processor()
 
 
 def _quota() -> float | None:

@@ -6,7 +6,7 @@ import torch
 
 from extrags.errors import ConfigError
 
-__all__ = ["chosen_device"]
+__all__ = ["chosen_device", "device_name"]
 
 
 def chosen_device(value: str, setting: str) -> torch.device:
@@ -23,3 +23,17 @@ def chosen_device(value: str, setting: str) -> torch.device:
     if value == "cuda" and not there:
         raise ConfigError(f"{setting}=cuda, but torch sees no CUDA device; use auto or cpu")
     return torch.device("cuda" if there and value != "cpu" else "cpu")
+
+
+def device_name(kind: str) -> str:
+    """What a device is, as records of costs name it.
+
+    Args:
+        kind: cpu or cuda.
+
+    Returns:
+        `cpu`; of a GPU its name, or `cuda` where torch sees none.
+    """
+    if kind == "cpu" or not torch.cuda.is_available():
+        return kind
+    return str(torch.cuda.get_device_name())

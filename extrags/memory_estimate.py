@@ -54,14 +54,26 @@ NETWORK = 6000
 """Bytes per pixel and thread of the network's working set, four views at once."""
 PSEUDO_VIEW = 220
 """Bytes per pixel of a restored view: when batches are joined, and as a target of the fine-tuning."""
-METRICS = 3500
-"""Bytes per pixel of the images that metrics are computed on at once, the features of LPIPS-VGG included."""
-ENLARGED = 100
-"""Bytes per pixel of a held-out view that is mixed with its restored one at the full size."""
+METRICS = 750
+"""Bytes per pixel and thread of the images that metrics are computed on at once, LPIPS of the small backbones
+included."""
+METRICS_VGG = 1750
+"""The same with the features of LPIPS-VGG."""
+ENLARGED = 300
+"""Bytes per pixel of a held-out view that is mixed with its restored one at the full size and given texture,
+and of what earlier stages keep of such a size."""
 CLIP_VIEWS = 8
 """Held-out views that are restored at once (`extrags.restoration.benchmark.evaluation`, which loads more)."""
-RENDERED_VIEW = 24
-"""Bytes per pixel of a rendered held-out view: what is computed of many at once is not mapped."""
+RENDERED_STACKS = (12, 4, 4)
+"""Bytes per pixel of the stacks of rendered held-out views: colours, opacity, depth."""
+RESTORED_STACKS = (12,)
+"""The same of restored ones, which share opacity and depth with those they were made from."""
+TRUE_SURFACE_STACKS = (4,)
+"""Bytes per pixel of all frames, of the depth that the true surface is fused from."""
+SHOWN = 125
+"""Bytes per pixel of a held-out view that the page shows: images, depth and errors of all renders."""
+PSEUDO_LOADED = 60
+"""Bytes per pixel of restored views as they are read: their 8 bits become floats, in memory."""
 FUSED_STACKS = (4, 4, 4, 4)
 """Bytes per pixel of the stacks of rendered training views: depth, and what is made of it to be fused."""
 PIXELS_MEASURED_AT_ONCE = 400_000
@@ -167,7 +179,11 @@ def estimate_memory(
     compared = round(pixels * min(1.0, COMPARED_WIDTH / size.width) ** 2)
     if config.coarse.inconsistent_frames == "ignore":
         compared = 0
-    steps = _held(TRAINING_STACKS, train * pixels) + max(STEP * pixels, COMPARED * train * compared)
+
+    def steps(frames: int) -> int:
+        """What the optimisation holds beside Gaussians, of so many frames."""
+        return _held(TRAINING_STACKS, frames * pixels) + max(STEP * pixels, COMPARED * frames * compared)
+
     batch_views = min(views, config.enhance.clips_per_batch * (config.explore.length + 1))
     network = NETWORK * threads * working if config.enhance.backend == "embedded" else 0
     references = REFERENCE * train * working
@@ -175,11 +191,23 @@ def estimate_memory(
     matched = round(pixels * min(1.0, config.depth.max_width / size.width) ** 2)
     looked_at = round(pixels * min(1.0, config.poses.max_width / size.width) ** 2)
     features = FEATURES * threads * looked_at
-    metrics = METRICS * max(pixels, min(PIXELS_MEASURED_AT_ONCE, pixels * max(1, all_frames - train)))
+    held_out = max(1, all_frames - train)
+    # Each thread has images of its own, as long as there are some.
+    measured = min(threads * max(pixels, PIXELS_MEASURED_AT_ONCE), held_out * pixels)
+    metrics = (METRICS_VGG if "vgg" in config.evaluate.lpips_nets else METRICS) * measured
     whole = PROCESS + _held(SEQUENCE_STACKS, all_frames * pixels)
-    rendered = RENDERED_VIEW * max(0, all_frames - train) * pixels
+    rendered = _held(RENDERED_STACKS, held_out * pixels)
+    true_surface = _held(TRUE_SURFACE_STACKS, all_frames * pixels)
+    # The oracle alone optimises with held-out frames too.
+    trained_on = all_frames if config.coarse.train_on == "all" else train
     # Held-out views are restored as well, in clips.
-    restored = references + CLIP * CLIP_VIEWS * working + network + ENLARGED * CLIP_VIEWS * pixels
+    restored = (
+        references
+        + CLIP * CLIP_VIEWS * working
+        + network
+        + ENLARGED * min(CLIP_VIEWS, held_out) * pixels
+        + _held(RESTORED_STACKS, held_out * pixels)
+    )
     if not explored or config.evaluate.restored == "none":
         restored = 0
     # The views of all renders are measured together: coarse, final, restored.
@@ -188,7 +216,10 @@ def estimate_memory(
         "ingest": whole + DECODED * source,
         "poses": whole + features,
         "depth": held + _held(DEPTH_STACKS, train * pixels) + max(features, DEPTH_FRAME * train * matched),
-        "coarse": held + steps + gaussian * coarse_gaussians,
+        "coarse": PROCESS
+        + _held(SEQUENCE_STACKS, trained_on * pixels)
+        + steps(trained_on)
+        + gaussian * coarse_gaussians,
         "surface": held + _held(FUSED_STACKS, train * fused),
         # It keeps what the surface took before it in the same process, and renders smaller views itself.
         "explore": held + _held(FUSED_STACKS, train * fused),
@@ -200,11 +231,14 @@ def estimate_memory(
             PSEUDO_VIEW * views * working,
         ),
         "finetune": held
-        + steps
+        + steps(train)
         + gaussian * config.finetune.growth * coarse_gaussians
         + PSEUDO_VIEW * views * working,
-        "evaluate": whole + max(stacks * rendered + metrics, rendered + restored),
-        "report": whole + 2 * rendered,
+        "evaluate": whole + max(stacks * rendered + metrics, rendered + max(restored, true_surface)),
+        "report": whole
+        + stacks * rendered
+        + SHOWN * min(config.report.held_out_views, held_out) * pixels
+        + PSEUDO_LOADED * views * working,
     }
     if config.uc_nerf.enabled:
         trained, shown = _uc_nerf(config.uc_nerf, size)

@@ -353,10 +353,15 @@ def stage_tasks(stage: str, config: PipelineConfig) -> tuple[str, ...]:
     return tuple(task for task, cost in modelled_tasks(stage).items() if cost.runs(config))
 
 
-def beyond_the_fit(task: str, config: PipelineConfig) -> tuple[str, ...]:
+def beyond_the_fit(task: str, config: PipelineConfig, *, devices: bool = True) -> tuple[str, ...]:
     """Settings of a task that no record behind the packaged coefficients had, and no term stands for.
 
     With the same ones, records of a store still tell what the task takes.
+
+    Args:
+        task: name.
+        config: settings of all stages. What `auto` means is not asked: devices have to be settled.
+        devices: whether work on a GPU is beyond; there was none where the coefficients were fitted.
 
     Returns:
         Names and values, in words; empty where the coefficients hold.
@@ -378,18 +383,23 @@ def beyond_the_fit(task: str, config: PipelineConfig) -> tuple[str, ...]:
         found.append(f"depth.monocular={config.depth.monocular}")
     if task in ("finetune", "finetune-judge") and config.finetune.keep_scene:
         found.append("finetune.keep_scene=true")
+    if devices and cost_of(task).on_device and config.device == "cuda":
+        found.append("device=cuda")
+    if devices and task == "depth" and config.depth.device == "cuda":
+        found.append("depth.device=cuda")
     return tuple(found)
 
 
 def stage_seconds(model: CostModel, stage: str, work: Workload) -> float:
     """Processor time of a stage on the reference machine, each task once.
 
-    Unknown tasks, and those with settings `beyond_the_fit`, count nothing.
+    Unknown tasks, and those with settings `beyond_the_fit`, count nothing. What runs on a GPU counts as on
+    that machine, which has none.
     """
     return sum(
         model.predict(task, work).seconds
         for task in stage_tasks(stage, work.config)
-        if task in model.time and not beyond_the_fit(task, work.config)
+        if task in model.time and not beyond_the_fit(task, work.config, devices=False)
     )
 
 

@@ -33,10 +33,10 @@ SET_PRESETS: dict[str, tuple[dict[str, Any], ...]] = {
 
 @dataclass(frozen=True)
 class Budget:
-    """A name, and what is changed of a profile.
+    """A name, and what is changed of a run.
 
     Args:
-        name: `profile` where nothing is.
+        name: `profile` where nothing is: the profile, with what was set for all runs.
         settings: overrides by dotted name.
     """
 
@@ -45,11 +45,11 @@ class Budget:
 
 
 def preset_budgets(name: str, config: PipelineConfig) -> list[Budget]:
-    """The budgets of a preset for a profile: one setting, or one group of settings, at a time.
+    """The budgets of a preset for a run: one setting, or one group of settings, at a time.
 
     Args:
         name: a key of `PRESETS` or `SET_PRESETS`.
-        config: of the profile.
+        config: of the run, whose values are multiplied: the profile's with what was set beside it.
 
     Raises:
         ConfigError: for an unknown preset.
@@ -70,15 +70,15 @@ def preset_budgets(name: str, config: PipelineConfig) -> list[Budget]:
 def budgets_of(
     config: PipelineConfig, presets: Sequence[str], vary: Sequence[Sequence[Mapping[str, Any]]]
 ) -> list[Budget]:
-    """All budgets of a profile: those of each preset, and every combination of what is varied.
+    """All budgets of a run: those of each preset, and every combination of what is varied.
 
     Args:
-        config: of the profile.
+        config: of the run, with the profile's settings and what was set beside it.
         presets: names; see `preset_budgets`.
         vary: of each axis, the overrides at its points (`parsed_vary`).
 
     Returns:
-        Without repetitions; without presets and axes the profile alone.
+        Without repetitions; without presets and axes the run as it is alone.
 
     Raises:
         ConfigError: for an unknown preset, or a setting on two axes.

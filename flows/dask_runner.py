@@ -25,10 +25,9 @@ import distributed
 from distributed.diagnostics.plugin import WorkerPlugin
 from prefect.settings import PREFECT_API_URL
 from prefect_dask import DaskTaskRunner
-from pydantic import BaseModel
 
-from extrags.config import PipelineConfig
 from extrags.errors import ConfigError
+from tasks.machine import asks_for_gpu
 from tasks.page_choice import PAGE_VARIABLE
 
 __all__ = ["ClusterTaskRunner", "needed_resources"]
@@ -145,24 +144,12 @@ def needed_resources(
         declared: see `ClusterTaskRunner.resources`.
     """
     needed = {}
-    if "GPU" in declared and _asks_for_gpu(inputs):
+    if "GPU" in declared and asks_for_gpu(inputs):
         needed["GPU"] = 1.0
     before = peak_mib() if "MEMORY" in declared else None
     if before is not None:
         needed["MEMORY"] = min(before * 2**20, declared["MEMORY"])
     return needed
-
-
-def _asks_for_gpu(inputs: Mapping[str, Any]) -> bool:
-    return inputs.get("device") == "cuda" or any(_on_gpu(value) for value in inputs.values())
-
-
-def _on_gpu(value: Any) -> bool:
-    # The settings of a whole run are a page's: they are shown, and nothing is computed by them.
-    if not isinstance(value, BaseModel) or isinstance(value, PipelineConfig):
-        return False
-    fields = [getattr(value, name) for name in type(value).model_fields]
-    return getattr(value, "device", None) == "cuda" or any(map(_on_gpu, fields))
 
 
 def _local_cluster(workers: int) -> distributed.LocalCluster:

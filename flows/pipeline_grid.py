@@ -12,8 +12,9 @@ from __future__ import annotations
 import json
 import logging
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
 from itertools import product
 from multiprocessing import get_context
@@ -36,6 +37,13 @@ __all__ = ["FORMAT", "Cell", "cells_of", "content_of", "in_own_process", "run_ce
 log = logging.getLogger(__name__)
 
 FORMAT = "extrags-pipeline-grid-1"
+_RESOLVED = dict.fromkeys(("budget", "changed", "settings"))
+"""What of a cell its settings, all of them together, stand for."""
+SHARING = (
+    "stages that cells of a repeat have in common were made once; every cell is charged their time. The "
+    "process that made them keeps what they took: memory depends on the order of cells, and is on no front"
+)
+DIED = "the process of this cell died, perhaps for lack of memory"
 
 
 @dataclass(frozen=True)
@@ -81,7 +89,8 @@ class Cell:
 def cells_of(
     sequences: Sequence[Chosen],
     methods: Sequence[str],
-    budgets: Sequence[tuple[str, Sequence[Budget]]],
+    profiles: Sequence[str],
+    budgets_of: Callable[[PipelineConfig], Sequence[Budget]],
     seeds: Sequence[int],
     repeats: int,
     settings: dict[str, Any],
@@ -91,14 +100,16 @@ def cells_of(
     Args:
         sequences: names, with settings that a manifest gives them.
         methods: names.
-        budgets: of each profile.
+        profiles: names.
+        budgets_of: the budgets of a run with these settings, which are those of its profile, method and
+            sequence, and the overrides: parts and multiples are of what the run would have.
         seeds: of all stages.
         repeats: how often everything is measured, each time from an empty store.
         settings: overrides of all runs; those of a sequence come on top of them.
 
     Returns:
-        Cells without repetitions: a budget that changes only what a method leaves out is the method's
-        `profile` budget.
+        Cells without repetitions, the first of those with equal settings: a budget that changes only what a
+        method leaves out is the method's `profile` budget.
 
     Raises:
         ConfigError: for an unknown method or profile, or a setting that is wrong or that the method pins.
@@ -106,23 +117,22 @@ def cells_of(
     from flows.methods import METHODS, method_config, pinned_settings
 
     found: dict[str, Cell] = {}
-    for repeat, chosen, (profile, inside), seed, method in product(
-        range(repeats), sequences, budgets, seeds, methods
-    ):
+    for repeat, chosen, profile, seed, method in product(range(repeats), sequences, profiles, seeds, methods):
         if method not in METHODS:
             raise ConfigError(f"no method {method!r}; known: {', '.join(METHODS)}")
-        for budget in inside:
-            pinned = pinned_settings(method)
+        own = {**settings, **chosen.settings}
+        pinned = pinned_settings(method)
+        for budget in budgets_of(method_config(method, profile, own, seed)):
             changed = {
                 name: value
                 for name, value in reaching(budget, METHODS[method].leave_out).items()
                 if name not in pinned
             }
             name = ", ".join(f"{key}={value}" for key, value in changed.items()) or "profile"
-            own = {**settings, **chosen.settings}
-            method_config(method, profile, {**own, **changed}, seed)
             cell = Cell(chosen.name, method, profile, name, changed, own, seed, repeat)
-            found.setdefault(cell.key, cell)
+            # What is varied may have the value that the run has anyway.
+            resolved = cell.config().model_dump(mode="json")
+            found.setdefault(digest_of({**asdict(cell), **_RESOLVED, "config": resolved}), cell)
     return list(found.values())
 
 
@@ -164,6 +174,7 @@ def run_grid(
     folder: Path,
     *,
     separate: bool = False,
+    settings: Mapping[str, Any] | None = None,
     run: Callable[[Cell, str], dict[str, Any]] | None = None,
 ) -> dict[str, Any]:
     """Run all cells that are not finished, and gather all.
@@ -172,11 +183,13 @@ def run_grid(
         cells: from `cells_of`.
         folder: of this grid: stores and finished cells.
         separate: give each cell a store of its own, so that nothing is shared.
+        settings: overrides of all runs, as `cells_of` was given them, for the result.
         run: what runs a cell; `in_own_process` by default.
 
     Returns:
-        `{format, machine, protocol, sharing, cases, cells, fronts}`; `cases` as of `run_cell`, `cells` their
-        means (`extrags.metrics.fronts.means_by_cell`), `fronts` as of `extrags.metrics.fronts.fronts`.
+        `{format, machine, protocol, settings, separate, sharing, cases, cells, fronts}`; `cases` as of
+        `run_cell`, `cells` their means (`extrags.metrics.fronts.means_by_cell`), `fronts` as of
+        `extrags.metrics.fronts.fronts`; none by memory where stages are shared.
 
     Raises:
         ConfigError: when the folder holds a grid of another machine, version or way of sharing.
@@ -199,7 +212,12 @@ def run_grid(
         where = f"{cell.sequence}, {cell.method}, {cell.profile}, {cell.budget}, seed {cell.seed}"
         log.info("cell %d of %d: %s", number, len(cells), where)
         store = folder / "stores" / (name if separate else f"repeat-{cell.repeat}")
-        case = run(cell, str(store.absolute()))
+        try:
+            case = run(cell, str(store.absolute()))
+        except BrokenProcessPool:
+            # The other cells go on: the same command would meet the same end at the same place.
+            log.warning("%s: %s", where, DIED)
+            case = _case_of(cell, error=DIED)
         if not case["error"]:
             # A cell that failed is tried again by the same command.
             _write(file, case)
@@ -209,12 +227,12 @@ def run_grid(
         "format": FORMAT,
         "machine": about,
         "protocol": PROTOCOL_VERSION,
-        "sharing": "none: a store for each cell"
-        if separate
-        else "stages that cells of a repeat have in common were made once; every cell is charged their time",
+        "settings": dict(settings or {}),
+        "separate": separate,
+        "sharing": "none: a store for each cell" if separate else SHARING,
         "cases": cases,
         "cells": means,
-        "fronts": fronts(means),
+        "fronts": [entry for entry in fronts(means) if separate or entry["cost"] != "peak_mib"],
     }
 
 
@@ -232,9 +250,9 @@ def run_cell(cell: Cell, store: str) -> dict[str, Any]:
     """Run a cell in this process; what fails is in the result, not raised.
 
     Returns:
-        `{method, profile, budget, changed, sequence, setting, seed, repeat, width, height, frames, seconds,
-        processor_seconds, peak_mib, shared_seconds, load_average, stages, metrics, error}`. Seconds are
-        those of all stages but evaluation, spent within this grid; `shared_seconds` the part of them that
+        `{method, profile, budget, changed, settings, sequence, setting, seed, repeat, width, height, frames,
+        seconds, processor_seconds, peak_mib, shared_seconds, load_average, stages, metrics, error}`. Seconds
+        are those of all stages but evaluation, spent within this grid; `shared_seconds` the part of them that
         was spent by a cell before. `stages` has `{stage, state, seconds, processor_seconds, peak_mib,
         shared_seconds}` of each, evaluation too.
     """
@@ -256,29 +274,20 @@ def run_cell(cell: Cell, store: str) -> dict[str, Any]:
     counted = [row for row in ran if row.stage not in NOT_COUNTED]
     processor = [row.processor_seconds for row in counted]
     peaks = [row.peak_mib for row in counted if row.peak_mib is not None]
-    name, _, setting = cell.sequence.partition("@")
     failed = next((row for row in outcome.stages if row.state == "failed"), None)
     # Where poses are estimated or refined, the sequence is theirs, and does not count its pixels.
     read = outcome.refs.get("ingest")
     counts = {} if read is None else Store(store).manifest(read).counts
-    return {
-        "method": cell.method,
-        "profile": cell.profile,
-        "budget": cell.budget,
-        "changed": cell.changed,
-        "sequence": name,
-        "setting": setting or None,
-        "seed": cell.seed,
-        "repeat": cell.repeat,
+    return _case_of(
+        cell,
         **{key: counts.get(key) for key in ("width", "height", "frames")},
-        "seconds": round(sum(row.made_seconds for row in counted), 3),
-        "processor_seconds": None
+        seconds=round(sum(row.made_seconds for row in counted), 3),
+        processor_seconds=None
         if None in processor
         else round(sum(value for value in processor if value is not None), 3),
-        "peak_mib": max(peaks) if peaks else None,
-        "shared_seconds": round(sum(map(_shared_seconds, counted)), 3),
-        "load_average": round(os.getloadavg()[0], 2),
-        "stages": [
+        peak_mib=max(peaks) if peaks else None,
+        shared_seconds=round(sum(map(_shared_seconds, counted)), 3),
+        stages=[
             {
                 "stage": row.stage,
                 "state": row.state,
@@ -289,8 +298,33 @@ def run_cell(cell: Cell, store: str) -> dict[str, Any]:
             }
             for row in ran
         ],
-        "metrics": outcome.metrics["final"] if failed is None else None,
-        "error": "" if failed is None else f"{failed.stage}: {failed.reason}",
+        metrics=outcome.metrics["final"] if failed is None else None,
+        error="" if failed is None else f"{failed.stage}: {failed.reason}",
+    )
+
+
+def _case_of(cell: Cell, **found: Any) -> dict[str, Any]:
+    """The JSON of a case: what the cell is, and what was found; the rest is unknown."""
+    name, _, setting = cell.sequence.partition("@")
+    return {
+        "method": cell.method,
+        "profile": cell.profile,
+        "budget": cell.budget,
+        "changed": cell.changed,
+        "settings": cell.settings,
+        "sequence": name,
+        "setting": setting or None,
+        "seed": cell.seed,
+        "repeat": cell.repeat,
+        **dict.fromkeys(("width", "height", "frames")),
+        "seconds": 0.0,
+        "processor_seconds": None,
+        "peak_mib": None,
+        "shared_seconds": 0.0,
+        "load_average": round(os.getloadavg()[0], 2),
+        "stages": [],
+        "metrics": None,
+        **found,
     }
 
 
@@ -301,7 +335,9 @@ def _shared_seconds(row: StageRow) -> float:
 
 def _claim(folder: Path, about: dict[str, Any], separate: bool) -> None:
     """Times of one machine and one version stand in one folder."""
-    mine = {name: about[name] for name in (*SAME_MACHINE, "versions", "commit")} | {"separate": separate}
+    mine = {name: about[name] for name in (*SAME_MACHINE, "device", "versions", "commit")} | {
+        "separate": separate
+    }
     file = folder / "grid.json"
     if not file.exists():
         _write(file, mine)

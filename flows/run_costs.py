@@ -128,13 +128,14 @@ def pace_here(store: Store, fallback: PipelineConfig, model: CostModel) -> Pace:
     """The pace of this machine: by the records of a store, else by a probe.
 
     Args:
-        store: with artefacts that were made on this machine.
+        store: its records of this kind of machine count (`recorded_costs`).
         fallback: settings of the run, and those that manifests do not hold.
         model: of the reference machine.
 
     Raises:
         StoreError: when the store cannot be read.
     """
+    fallback = _on_devices(fallback)
     elapsed, processor = recorded_costs(store, fallback)
     known = model.pace(processor, fallback)
     if known and sum(cost.seconds for _, cost in processor) >= ENOUGH_SECONDS:
@@ -161,7 +162,8 @@ def predict_run(
     """What a run will cost on this machine, when nothing of it is in the store.
 
     Of tasks with settings that the model does not know (`extrags.run_costs.beyond_the_fit`), records of the
-    store tell, where it has some with the same settings; else they are `unknown`.
+    store tell, where it has some with the same settings; else they are `unknown`. So it is with tasks that
+    run on a GPU.
 
     Args:
         store: its records tell how fast this machine is; without enough of them a probe does.
@@ -175,6 +177,7 @@ def predict_run(
         StoreError: when the store cannot be read.
     """
     model = model or packaged_model()
+    work = replace(work, config=_on_devices(work.config))
     if "enhance" not in stages:
         # Nothing is restored, with whatever backend.
         unrestored = {"enhance.backend": "embedded", "enhance.train_iterations": 0}
@@ -257,15 +260,21 @@ def unplanned_work(
     return planned_work(store, replace(outcome, plan=None), config)
 
 
-def recorded_costs(store: Store, fallback: PipelineConfig) -> tuple[list[Record], list[Record]]:
+def recorded_costs(
+    store: Store, fallback: PipelineConfig, *, of_this_machine: bool = True
+) -> tuple[list[Record], list[Record]]:
     """Costs that the manifests of a store tell of, of tasks in their present version.
+
+    A store may be shared. What another processor or GPU, or other kernels, took is no record of this machine.
+    Manifests of earlier versions do not tell where they were made, and count where none does.
 
     Waves of an exploration, and batches of a restoration, are added up to the artefact they lead to. Settings
     that a manifest does not hold are the fallback's.
 
     Args:
-        store: with artefacts that were made on this machine.
+        store: with artefacts.
         fallback: settings of all stages.
+        of_this_machine: leave out what another kind of machine made.
 
     Returns:
         Records with elapsed time, and those with processor time, which earlier versions did not measure.
@@ -280,13 +289,19 @@ def recorded_costs(store: Store, fallback: PipelineConfig) -> tuple[list[Record]
     versions = all_stage_versions()
     modelled = {task for stage in STAGES for task in modelled_tasks(stage)}
     elapsed, processor = [], []
-    for manifest in manifests.values():
-        if manifest.stage not in modelled or versions.get(manifest.stage) != manifest.version:
-            continue
+    candidates = [
+        manifest
+        for manifest in manifests.values()
+        if manifest.stage in modelled and versions.get(manifest.stage) == manifest.version
+    ]
+    where_known = any("processor" in manifest.counts for manifest in candidates)
+    for manifest in candidates:
         work = _workload(manifest, manifests, fallback)
         if work is None:
             continue
         parts = [manifest, *_parts(manifest, manifests)]
+        if of_this_machine and where_known and not all(map(_made_here, parts)):
+            continue
         peaks = [float(value) for part in parts if isinstance(value := part.counts.get("peak_mib"), float)]
         peak = max(peaks, default=None)
         elapsed.append((work, TaskCost(manifest.stage, sum(part.elapsed_s for part in parts), peak)))
@@ -295,6 +310,31 @@ def recorded_costs(store: Store, fallback: PipelineConfig) -> tuple[list[Record]
             seconds = sum(float(value) for value in spent if isinstance(value, int | float))
             processor.append((work, TaskCost(manifest.stage, seconds, peak)))
     return elapsed, processor
+
+
+def _made_here(manifest: Manifest) -> bool:
+    """Whether it was made on a machine of this kind; not where it does not say."""
+    from extrags.cores import processor_name
+    from extrags.devices import device_name
+    from extrags.raster import native_isa
+
+    counts = manifest.counts
+    kind = "cpu" if counts.get("device") == "cpu" else "cuda"
+    here = (processor_name(), native_isa(), device_name(kind))
+    return (counts.get("processor"), counts.get("isa"), counts.get("device")) == here
+
+
+def _on_devices(config: PipelineConfig) -> PipelineConfig:
+    """The same settings where devices that are `auto` are what that means on this machine."""
+    from extrags.devices import chosen_device
+    from extrags.placement import run_device
+
+    config = config.with_run_device()
+    depth = config.depth
+    if depth.device == "auto":
+        kind = chosen_device("auto", "depth.device").type
+        depth = depth.model_copy(update={"device": kind})
+    return config.model_copy(update={"device": run_device(config), "depth": depth})
 
 
 def _parts(manifest: Manifest, manifests: Mapping[str, Manifest]) -> list[Manifest]:
@@ -368,6 +408,8 @@ def _config(line: list[Manifest], fallback: PipelineConfig) -> PipelineConfig:
             if isinstance(settings, dict) and group not in changed:
                 known = type(getattr(fallback, group)).model_fields
                 changed[group] = {name: value for name, value in settings.items() if name in known}
+    device = line[0].config.get("device")
+    fallback = fallback.model_copy(update={"device": "cuda" if device == "cuda" else "cpu"})
     # A scene says what it is by the task that made it, not by a setting.
     changed["uc_nerf"] = {"enabled": any(item.stage == "uc-nerf" for item in line)}
     # Of the restorer, others hold no more than what they read themselves.

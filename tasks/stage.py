@@ -36,6 +36,7 @@ from pydantic import BaseModel
 from extrags.errors import ConfigError
 from extrags.store import Ref, Slot, Store, canonical, digest_of
 from tasks.locks import FlockManager
+from tasks.machine import machine_counts
 from tasks.memory import peak_memory
 from tasks.progress import reporting
 from tasks.run_log import run_log
@@ -257,6 +258,7 @@ def _made(
             body(slot, **inputs)
         slot.counts["peak_mib"] = peak.mib
         slot.counts.update(elapsed_s=spent.elapsed_s, processor_s=spent.processor_s)
+        slot.counts.update(machine_counts(inputs))
     return slot.ref
 
 

@@ -23,6 +23,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from extrags.cores import processor_name
+from extrags.devices import device_name
 from extrags.errors import ConfigError
 from extrags.raster import native
 from extrags.raster.peers import TimedPeer, check_peers, errors, exact_gradients, gradients, use_threads
@@ -91,15 +93,11 @@ def bench_scene(size: BenchSize, *, seed: int = 0) -> dict[str, Tensor]:
 
 
 def machine() -> dict[str, Any]:
-    """The environment of the measurements: processor, threads, versions, commit."""
-    processor = platform.processor()
-    info = Path("/proc/cpuinfo")
-    if info.exists():
-        names = [x for x in info.read_text().splitlines() if x.startswith("model name")]
-        processor = names[0].split(":", 1)[1].strip() if names else processor
+    """The environment of the measurements: processor, threads, GPU, versions, commit."""
     load = os.getloadavg()[0]
     return {
-        "processor": processor,
+        "processor": processor_name(),
+        "device": device_name("cuda" if torch.cuda.is_available() else "cpu"),
         "cores": os.cpu_count(),
         "threads": native.num_threads() if native.native_isa() else 1,
         "isa": native.native_isa(),

@@ -80,6 +80,7 @@ class Cost:
         includes: tasks whose time on record is added to this one's.
         shares: shares of tasks in the time, where one model stands for several.
         renders: whether its time is that of the rasteriser.
+        on_device: whether it works on the run's device (`device`): what it takes on a GPU is another thing.
         restores: whether it prepares the restorer of `enhance.backend`, or runs it.
         of_final_scene: whether its memory depends on the Gaussians of the final scene, not of the coarse one.
         unfitted: why the packaged model has no coefficients of it; empty where it has.
@@ -94,6 +95,7 @@ class Cost:
     includes: tuple[str, ...] = ()
     shares: Mapping[str, float] = field(default_factory=dict)
     renders: bool = False
+    on_device: bool = False
     restores: bool = False
     of_final_scene: bool = False
     unfitted: str = ""

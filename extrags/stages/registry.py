@@ -86,6 +86,7 @@ REGISTRY: tuple[Stage, ...] = (
                         "iterations*coefficients",
                     ),
                     renders=True,
+                    on_device=True,
                 ),
             ),
             StageTask(name="continued-coarse", in_place=True, cost="it depends on the scene it goes on from"),
@@ -99,7 +100,7 @@ REGISTRY: tuple[Stage, ...] = (
         page_parts=("plan",),
         other_parts=("assess",),
         tasks=(
-            StageTask(name="assess", cost=Cost(terms=("one", "gaussians"), renders=True)),
+            StageTask(name="assess", cost=Cost(terms=("one", "gaussians"), renders=True, on_device=True)),
             StageTask(name="plan", cost=Cost()),
         ),
     ),
@@ -167,6 +168,7 @@ REGISTRY: tuple[Stage, ...] = (
                     # Blending and filling need no preparation.
                     runs=lambda config: config.enhance.backend != "classical",
                     restores=True,
+                    on_device=True,
                 ),
             ),
             StageTask(name="enhance-keyframes", cost="it has a share of the time of enhance"),
@@ -204,6 +206,7 @@ REGISTRY: tuple[Stage, ...] = (
                     runs=lambda config: config.finetune.judge.enabled,
                     renders=True,
                     restores=True,
+                    on_device=True,
                 ),
             ),
             StageTask(
@@ -218,6 +221,7 @@ REGISTRY: tuple[Stage, ...] = (
                     ),
                     renders=True,
                     of_final_scene=True,
+                    on_device=True,
                 ),
             ),
         ),
@@ -237,7 +241,13 @@ REGISTRY: tuple[Stage, ...] = (
             StageTask(name="uc-nerf-render", cost="a baseline's, of which there are no records"),
             StageTask(
                 name="evaluate-render",
-                cost=Cost(terms=("test", "test*pixels"), repeats="scenes", renders=True, of_final_scene=True),
+                cost=Cost(
+                    terms=("test", "test*pixels"),
+                    repeats="scenes",
+                    renders=True,
+                    of_final_scene=True,
+                    on_device=True,
+                ),
             ),
             StageTask(
                 name="evaluate-restore",
@@ -252,9 +262,13 @@ REGISTRY: tuple[Stage, ...] = (
             StageTask(
                 name="evaluate-views",
                 intermediate=True,
-                cost=Cost(terms=("test*pixels*stacks", "test*pixels*vgg*passes"), of_final_scene=True),
+                cost=Cost(
+                    terms=("test*pixels*stacks", "test*pixels*vgg*passes"),
+                    of_final_scene=True,
+                    on_device=True,
+                ),
             ),
-            StageTask(name="evaluate", cost=Cost(repeats="measured", of_final_scene=True)),
+            StageTask(name="evaluate", cost=Cost(repeats="measured", of_final_scene=True, on_device=True)),
         ),
     ),
     Stage(

@@ -26,7 +26,7 @@ EXAMPLES = """examples:
 
 --vary NAME=V,V      each value is a budget; several --vary are combined, every value with every other
 --vary A+B=1+2,3+4   settings that change together, with a value for each (or one for all of them)
---budgets PRESET     one thing at a time: iterations, gaussians, views (parts and multiples of the profile's),
+--budgets PRESET     one thing at a time: iterations, gaussians, views (parts and multiples of the run's),
                      size, steps, precision
 A budget reaches the methods that have the stage and do not pin the setting."""
 
@@ -56,7 +56,7 @@ def add_arguments(parser: Parser) -> None:
         nargs="+",
         default=[],
         metavar="PRESET",
-        help=f"of {', '.join((*PRESETS, *SET_PRESETS))}: see below (default: the profile's settings alone)",
+        help=f"of {', '.join((*PRESETS, *SET_PRESETS))}: see below (default: the run's settings alone)",
     )
     parser.add_argument(
         "--vary",
@@ -72,7 +72,8 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument(
         "--separate",
         action="store_true",
-        help="do not share stages between runs (default: compute once, charge its time to each)",
+        help="do not share stages between runs (default: compute once, charge its time to each; memory "
+        "is then not compared)",
     )
     add_output(
         parser,
@@ -98,7 +99,6 @@ def pipeline(given: argparse.Namespace) -> int:
 
     folder = Path(given.output)
     prepare(folder.absolute() / "state", debug=given.debug)
-    from extrags.config import profile_config
     from extrags.report.fronts_plot import write_fronts_plot
     from flows.budgets import budgets_of, parsed_vary
     from flows.pipeline_grid import cells_of, run_grid
@@ -106,20 +106,18 @@ def pipeline(given: argparse.Namespace) -> int:
     from flows.selection import chosen_sequences
 
     vary = [parsed_vary(text) for text in given.vary]
-    budgets = [
-        (profile, budgets_of(profile_config(profile), items(given.budgets), vary))
-        for profile in items(given.profiles)
-    ]
+    presets, settings = items(given.budgets), given.settings or {}
     cells = cells_of(
         chosen_sequences(given.sequences),
         items(given.methods),
-        budgets,
+        items(given.profiles),
+        lambda config: budgets_of(config, presets, vary),
         parsed_seeds(given.seeds),
         given.repeats,
-        given.settings or {},
+        settings,
     )
     _check_models(cells, preflight)
-    found = run_grid(cells, folder, separate=given.separate)
+    found = run_grid(cells, folder, separate=given.separate, settings=settings)
     text = json.dumps(found, indent=1)
     write_file(folder / "results.json", text)
     table = grid_markdown(found)
@@ -160,7 +158,8 @@ def grid_markdown(found: dict[str, Any]) -> str:
         if any(figure.name in cell["figures"] for cell in found["cells"])
     ]
     on = _front_members(found, [figure.name for figure in shown])
-    header = ["sequence", "size", "method", "profile", "budget", "runs", "s", "processor s", "MiB"]
+    header = ["sequence", "size", "method", "profile", "budget", "runs", "s", "processor s"]
+    header += ["MiB" if found["separate"] else "MiB*"]
     header += [figure.label for figure in shown]
     lines = [f"| {' | '.join(header)} |", f"|{'---|' * 5}{'---:|' * (len(header) - 5)}"]
     for cell in found["cells"]:
@@ -175,11 +174,14 @@ def grid_markdown(found: dict[str, Any]) -> str:
             row.append(f"**{text}**" if (*_identity(cell), figure.name) in on else text)
         lines.append(f"| {' | '.join(row)} |")
     lines += ["", "Bold: on the front of this figure against processor time, within its sequence and size."]
+    if not found["separate"]:
+        # Stages do not give back all that they took.
+        lines += ["", "*: depends on which run made what runs share; comparable with --separate alone."]
     failed = [case for case in found["cases"] if case["error"]]
     lines += [""] * bool(failed)
     for case in failed:
         what = f"{_name(case)}, {case['method']}, {case['profile']}, {case['budget']}, seed {case['seed']}"
-        lines.append(f"* {what} failed in {case['error']}")
+        lines.append(f"* {what} failed: {case['error']}")
     return "\n".join(lines) + "\n"
 
 

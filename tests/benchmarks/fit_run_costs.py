@@ -38,7 +38,9 @@ def main() -> None:
 
     def records(roots: list[str]) -> list[tuple[Workload, TaskCost]]:
         usual = profile_config("quick")
-        return [item for root in roots for item in recorded_costs(Store(root), usual)[1]]
+        return [
+            item for root in roots for item in recorded_costs(Store(root), usual, of_this_machine=False)[1]
+        ]
 
     known = records(given.fit)
     model = fitted(known, probe_seconds()) if given.tasks is None else with_tasks(known, given.tasks)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from extrags.config import PROFILES, UcNerfConfig, profile_config
+from extrags.config import PROFILES, PipelineConfig, UcNerfConfig, profile_config
 from extrags.memory_estimate import (
     CLIP_VIEWS,
     COMPARED_WIDTH,
@@ -51,6 +51,78 @@ class TestEstimate:
         """Of runs on a path-traced colon, two threads each; hundreds of frames are these several times."""
         found = estimate_memory(profile_config(profile), size)
         assert 0.9 < found.by_stage[stage] / (recorded_mib * 2**20) < 1.4
+
+    @pytest.mark.parametrize(
+        ("profile", "size", "threads", "recorded_mib"),
+        [
+            ("quick", HUNDREDS, 1, 2697),
+            ("quick", FrameSize(1000, 980, 1920, 1080), 1, 5873),
+            ("balanced", FrameSize(48, 20, 1350, 1080), 2, 5810),
+        ],
+    )
+    def test_covers_recorded_evaluations_with_alexnet(
+        self, profile: str, size: FrameSize, threads: int, recorded_mib: float
+    ) -> None:
+        config = profile_config(profile).with_overrides({"evaluate.lpips_nets": ("alex",)})
+        found = estimate_memory(config, size, threads=threads)
+        assert 1.0 < found.by_stage["evaluate"] / (recorded_mib * 2**20) < 1.8
+
+    @pytest.mark.parametrize(
+        ("views", "width", "height", "threads", "vgg", "measured_mib"),
+        [
+            # What three made-up sets of renders, their figures and LPIPS took beyond a process without them.
+            (400, 160, 128, 1, False, 446),
+            (240, 320, 256, 1, False, 540),
+            (20, 160, 128, 1, True, 543),
+            (40, 160, 128, 2, True, 990),
+            (2, 675, 540, 1, True, 622),
+        ],
+    )
+    def test_covers_measured_photometric_figures(
+        self, views: int, width: int, height: int, threads: int, vgg: bool, measured_mib: float
+    ) -> None:
+        config = profile_config("quick").with_overrides(
+            {"evaluate.restored": "none", "evaluate.lpips_nets": ("alex", "vgg") if vgg else ("alex",)}
+        )
+        # Of a process: interpreter, libraries, and the frames.
+        held = 200
+        found = estimate_memory(config, FrameSize(views + 4, 4, width, height), threads=threads)
+        share = found.by_stage["evaluate"] / ((measured_mib + held) * 2**20)
+        assert 1.0 < share < 2.6
+
+    def test_renders_of_long_recordings_are_mapped_files(self) -> None:
+        """Ten times the held-out views hold no more than full stacks do; as arrays they would be 100 GB."""
+        config = profile_config("quick")
+        some, many = (
+            estimate_memory(config, FrameSize(100 + views, 100, 1920, 1080)) for views in (100, 1000)
+        )
+        for stage in ("evaluate", "report"):
+            assert many.by_stage[stage] < 1.01 * some.by_stage[stage]
+        # 1,000 frames, of which one in ten trains, fit where they were said to take 143 GB.
+        assert many.peak_gb < 8
+
+    def test_each_thread_measures_images_of_its_own(self) -> None:
+        config = profile_config("balanced")
+
+        def needed(threads: int, frames: int = 400) -> int:
+            size = FrameSize(frames, 20, 675, 540)
+            return estimate_memory(config, size, threads=threads).by_stage["evaluate"]
+
+        assert needed(8) > 1.5 * needed(4) > 1.5 * needed(2)
+        # Of two held-out frames no more than two are measured at once.
+        assert estimate_memory(
+            config.with_overrides({"evaluate.restored": "none"}), FrameSize(22, 20, 675, 540), threads=8
+        ).by_stage["evaluate"] < needed(4)
+
+    def test_the_oracle_is_trained_on_all_frames(self) -> None:
+        config = profile_config("balanced")
+        oracle = config.with_overrides({"coarse.train_on": "all"})
+        few, all_ = FrameSize(600, 60, 675, 540), FrameSize(600, 600, 675, 540)
+
+        def coarse(settings: PipelineConfig, size: FrameSize) -> int:
+            return estimate_memory(settings, size, until="coarse").by_stage["coarse"]
+
+        assert coarse(oracle, few) == coarse(config, all_) > coarse(config, few)
 
     def test_covers_many_full_size_training_frames(self) -> None:
         """A bound: measured were 20 iterations, long before there are as many Gaussians as there may be."""
@@ -128,7 +200,7 @@ class TestEstimate:
         assert alone.by_stage["finetune"] < whole.by_stage["finetune"]
 
     def test_names_the_stage_that_needs_most(self) -> None:
-        found = estimate_memory(profile_config("quick"), FrameSize(48, 20, 160, 128))
+        found = estimate_memory(profile_config("quick"), FrameSize(48, 20, 1350, 1080))
         assert found.stage == "evaluate"
         assert f"{found.peak_gb:.1f} GB, in evaluate" in str(found)
 

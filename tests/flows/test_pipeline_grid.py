@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +15,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from extrags.config import PipelineConfig, profile_config
 from extrags.errors import ConfigError
 from extrags.metrics.registry import PROTOCOL_VERSION
 from extrags.restoration.diffusion.weights import COLONS, starting_weights
-from flows.budgets import Budget
+from flows.budgets import Budget, budgets_of, parsed_vary
 from flows.cli import main
 from flows.commands.bench_pipeline import grid_markdown
-from flows.pipeline_grid import Cell, cells_of, run_cell, run_grid
+from flows.pipeline_grid import DIED, Cell, cells_of, run_cell, run_grid
 from flows.selection import Chosen
 from tests.documented_json import undocumented
 from tests.flows.tiny import SEQUENCE, TINY
@@ -26,25 +31,60 @@ SMALL = {**TINY, "ingest.max_frames": 8}
 BUDGETS = [Budget("few", {"coarse.iterations": 10}), Budget("more", {"coarse.iterations": 20})]
 
 
+def of(budgets: list[Budget]) -> Callable[[PipelineConfig], list[Budget]]:
+    """The same budgets, whatever the settings of a run."""
+    return lambda _: budgets
+
+
 def cells(repeats: int = 1, **settings: Any) -> list[Cell]:
     return cells_of(
-        [Chosen("phantom/0@sparse")], ["coarse"], [("quick", BUDGETS)], [0], repeats, {**SMALL, **settings}
+        [Chosen("phantom/0@sparse")], ["coarse"], ["quick"], of(BUDGETS), [0], repeats, {**SMALL, **settings}
     )
 
 
 class TestCells:
     def test_budgets_that_do_not_reach_a_method_are_one_cell(self) -> None:
         budgets = [Budget("a", {"finetune.iterations": 5}), Budget("b", {"finetune.iterations": 6})]
-        found = cells_of([Chosen(SEQUENCE)], ["coarse", "extrags"], [("quick", budgets)], [0], 1, {})
+        found = cells_of([Chosen(SEQUENCE)], ["coarse", "extrags"], ["quick"], of(budgets), [0], 1, {})
         assert [(cell.method, cell.budget) for cell in found] == [
             ("coarse", "profile"),
             ("extrags", "finetune.iterations=5"),
             ("extrags", "finetune.iterations=6"),
         ]
 
+    def test_a_preset_multiplies_what_the_run_would_have(self) -> None:
+        chosen = [Chosen(SEQUENCE), Chosen("phantom/1@sparse", {"coarse.iterations": 400})]
+        settings = {"coarse.iterations": 3000, "finetune.iterations": 600}
+        found = cells_of(
+            chosen,
+            ["extrags"],
+            ["quick"],
+            lambda config: budgets_of(config, ["iterations"], []),
+            [0],
+            1,
+            settings,
+        )
+        counts = [(cell.config().coarse.iterations, cell.config().finetune.iterations) for cell in found]
+        assert counts[:4] == [(750, 150), (1500, 300), (3000, 600), (6000, 1200)]
+        assert counts[4:] == [(100, 150), (200, 300), (400, 600), (800, 1200)]
+
+    def test_runs_of_equal_settings_are_one_cell(self) -> None:
+        own = profile_config("quick").coarse.iterations
+        vary = [parsed_vary(f"coarse.iterations={own},3000")]
+
+        def budgets(*presets: str) -> list[str]:
+            found = cells_of(
+                [Chosen(SEQUENCE)], ["coarse"], ["quick"], lambda c: budgets_of(c, presets, vary), [0], 1, {}
+            )
+            return [cell.budget for cell in found]
+
+        assert budgets() == [f"coarse.iterations={own}", "coarse.iterations=3000"]
+        # The profile's is there already, as that of the preset.
+        assert budgets("views") == ["profile", "coarse.iterations=3000"]
+
     def test_settings_of_a_manifest_hold_for_their_sequence(self) -> None:
         chosen = [Chosen(SEQUENCE, {"coarse.iterations": 77}), Chosen("phantom/1@sparse")]
-        found = cells_of(chosen, ["coarse"], [("quick", [Budget()])], [0], 1, {"coarse.max_points": 900})
+        found = cells_of(chosen, ["coarse"], ["quick"], of([Budget()]), [0], 1, {"coarse.max_points": 900})
         assert [cell.settings for cell in found] == [
             {"coarse.max_points": 900, "coarse.iterations": 77},
             {"coarse.max_points": 900},
@@ -55,13 +95,14 @@ class TestCells:
             cells_of(
                 [Chosen(SEQUENCE)],
                 ["coarse"],
-                [("quick", [Budget("x", {"coarse.iterations": -1})])],
+                ["quick"],
+                of([Budget("x", {"coarse.iterations": -1})]),
                 [0],
                 1,
                 {},
             )
         with pytest.raises(ConfigError, match="no method 'magic'"):
-            cells_of([Chosen(SEQUENCE)], ["magic"], [("quick", [Budget()])], [0], 1, {})
+            cells_of([Chosen(SEQUENCE)], ["magic"], ["quick"], of([Budget()]), [0], 1, {})
 
 
 class TestGrid:
@@ -99,6 +140,22 @@ class TestGrid:
         run_grid(cells(), tmp_path / "separate", separate=True, run=run)
         assert len(set(stores)) == 2
 
+    def test_memory_is_compared_where_nothing_is_shared(self, tmp_path: Path) -> None:
+        """The cell that makes what others share carries it on, whichever cell comes first."""
+        grids = {
+            separate: run_grid(
+                cells(), tmp_path / str(separate), separate=separate, run=lambda cell, _: _case(cell)
+            )
+            for separate in (False, True)
+        }
+        costs = {separate: {entry["cost"] for entry in found["fronts"]} for separate, found in grids.items()}
+        assert costs[False] == {"seconds", "processor_seconds"}
+        assert costs[True] == {"seconds", "processor_seconds", "peak_mib"}
+        assert "| MiB* |" in grid_markdown(grids[False])
+        assert "comparable with --separate alone" in grid_markdown(grids[False])
+        assert "| MiB |" in grid_markdown(grids[True])
+        assert "--separate" not in grid_markdown(grids[True])
+
     def test_failed_cells_are_tried_again(self, tmp_path: Path) -> None:
         run_grid(
             cells(), tmp_path, run=lambda cell, _: {**_case(cell), "error": "coarse: no", "metrics": None}
@@ -106,6 +163,24 @@ class TestGrid:
         tried = []
         run_grid(cells(), tmp_path, run=lambda cell, _: tried.append(cell) or _case(cell))
         assert len(tried) == 2
+
+    def test_a_cell_whose_process_dies_has_failed_and_the_others_go_on(self, tmp_path: Path) -> None:
+        def run(cell: Cell, store: str) -> dict[str, Any]:
+            if cell.changed == {"coarse.iterations": 10}:
+                with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+                    pool.submit(os._exit, 9).result()
+            return _case(cell)
+
+        found = run_grid(cells(), tmp_path, run=run)
+        assert [case["error"] for case in found["cases"]] == [DIED, ""]
+        assert [cell["runs"] for cell in found["cells"]] == [0, 1]
+        table = grid_markdown(found)
+        assert f"coarse, quick, coarse.iterations=10, seed 0 failed: {DIED}\n" in table
+        assert not undocumented(found["cases"][0], "a-case-of-a-grid")
+        # It is tried again by the same command.
+        tried: list[Cell] = []
+        run_grid(cells(), tmp_path, run=lambda cell, _: tried.append(cell) or _case(cell))
+        assert [cell.changed for cell in tried] == [{"coarse.iterations": 10}]
 
     def test_what_reads_changed_files_is_measured_anew(self, tmp_path: Path) -> None:
         source, scene = tmp_path / "source", tmp_path / "theirs.ply"
@@ -121,7 +196,7 @@ class TestGrid:
         def measured(sequence: str, **settings: Any) -> int:
             ran.clear()
             given = {name.replace("__", "."): value for name, value in settings.items()}
-            found = cells_of([Chosen(sequence)], ["coarse"], [("quick", [Budget()])], [0], 1, given)
+            found = cells_of([Chosen(sequence)], ["coarse"], ["quick"], of([Budget()]), [0], 1, given)
             run_grid(found, tmp_path / "grid", run=run)
             return len(ran)
 
@@ -143,10 +218,21 @@ class TestGrid:
         record.write_text(record.read_text() + "\n")
         assert [measured(SEQUENCE, **own) for _ in range(2)] == [1, 0]
 
+    def test_results_say_what_was_run(self, tmp_path: Path) -> None:
+        chosen = [Chosen(str(tmp_path), {"coarse.max_points": 900})]
+        budgets = of([Budget("few", {"coarse.iterations": 10})])
+        found = cells_of(chosen, ["coarse"], ["quick"], budgets, [0], 1, SMALL)
+        result = run_grid(found, tmp_path / "grid", settings=SMALL, run=run_cell)
+        (case,) = result["cases"]
+        assert result["settings"] == SMALL
+        assert case["changed"] == {"coarse.iterations": 10}
+        assert case["settings"]["ingest.max_frames"] == 8
+        assert case["settings"]["coarse.max_points"] == 900
+
     def test_a_source_that_cannot_be_read_is_a_cell_that_fails(self, tmp_path: Path) -> None:
         (tmp_path / "empty").mkdir()
         found = cells_of(
-            [Chosen(str(tmp_path / "empty"))], ["coarse"], [("quick", [Budget()])], [0], 1, SMALL
+            [Chosen(str(tmp_path / "empty"))], ["coarse"], ["quick"], of([Budget()]), [0], 1, SMALL
         )
         (case,) = run_grid(found, tmp_path / "grid", run=run_cell)["cases"]
         assert "the folder is empty" in case["error"]
@@ -185,7 +271,10 @@ def test_the_verbs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert (tmp_path / "fronts.png").stat().st_size > 1000
     result = tmp_path / "results.json"
     assert not undocumented(json.loads(result.read_text()), "bench-pipeline")
-    assert len(json.loads(result.read_text())["cases"]) == 1
+    (case,) = json.loads(result.read_text())["cases"]
+    assert case["changed"] == {"coarse.iterations": 5}
+    assert case["settings"] == json.loads(result.read_text())["settings"]
+    assert case["settings"]["ingest.max_frames"] == 8
     compared = tmp_path / "compared.json"
     assert main(["bench", "compare", str(result), str(result), "--json", str(compared)]) == 0
     assert json.loads(compared.read_text())["rows"]
@@ -207,7 +296,7 @@ def test_the_table_says_what_failed(tmp_path: Path) -> None:
     assert "| phantom/0@sparse | - | coarse | quick |" in table
     assert "0 (1 failed)" in table
     assert "* phantom/0@sparse, coarse, quick, " in table
-    assert table.count("seed 0 failed in ingest: no such file\n") == 2
+    assert table.count("seed 0 failed: ingest: no such file\n") == 2
     fine = run_grid(cells(), tmp_path / "fine", run=lambda cell, _: _case(cell))
     assert "failed" not in grid_markdown(fine)
 

@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
+import inspect
+from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
+from pkgutil import iter_modules
 
 import pytest
 from PIL import Image
+from prefect import Task
 
+import tasks
+from extrags import placement
 from extrags.config import PipelineConfig, profile_config
+from extrags.cores import processor_name
 from extrags.errors import SourceNotFoundError
+from extrags.raster import native_isa
 from extrags.run_costs import CostModel, Workload, packaged_model
+from extrags.stages import STAGES, modelled_tasks
 from extrags.store import Store
 from flows import run_costs
 from flows.commands.plan import print_prediction
@@ -100,6 +110,116 @@ def test_the_restorer_of_a_record_is_the_one_it_was_made_with(filled: Store) -> 
     assert pace["enhance"] == pytest.approx(pace["evaluate"])
     assert other["enhance"] != pace["enhance"]
     assert "evaluate-restore" not in other
+
+
+class TestMachines:
+    """A store may be shared by machines, and a machine have a GPU."""
+
+    @staticmethod
+    def made_elsewhere(
+        store: Store, monkeypatch: pytest.MonkeyPatch, counts: dict[str, object | None]
+    ) -> None:
+        """What the store holds, as if its manifests told this of the machine; None: nothing."""
+        changed = [
+            manifest.model_copy(
+                update={
+                    "counts": {
+                        name: value
+                        for name, value in {**manifest.counts, **counts}.items()
+                        if value is not None
+                    }
+                }
+            )
+            for manifest in store.ls()
+        ]
+        monkeypatch.setattr(Store, "ls", lambda *_: changed)
+
+    def test_manifests_tell_where_they_were_made(self, filled: Store) -> None:
+        for manifest in filled.ls("coarse*"):
+            assert manifest.counts["processor"] == processor_name()
+            assert manifest.counts["isa"] == native_isa()
+            assert manifest.counts["device"] == "cpu"
+
+    @pytest.mark.parametrize("other", [{"processor": "another"}, {"isa": "sse2"}, {"device": "another GPU"}])
+    def test_records_of_other_machines_do_not_count(
+        self, filled: Store, monkeypatch: pytest.MonkeyPatch, other: dict[str, object | None]
+    ) -> None:
+        self.made_elsewhere(filled, monkeypatch, other)
+        assert recorded_costs(filled, CONFIG) == ([], [])
+        assert recorded_costs(filled, CONFIG, of_this_machine=False)[0]
+
+    def test_records_without_a_machine_count_where_all_are_such(
+        self, filled: Store, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        told = filled.ls()
+        number = len(recorded_costs(filled, CONFIG)[0])
+        self.made_elsewhere(filled, monkeypatch, dict.fromkeys(("processor", "isa", "device")))
+        assert len(recorded_costs(filled, CONFIG)[0]) == number
+        untold = filled.ls()
+        # One that tells is enough for the others to be of who knows which machine.
+        mixed = [one if one.stage == "coarse" else other for one, other in zip(told, untold, strict=True)]
+        monkeypatch.setattr(Store, "ls", lambda *_: mixed)
+        assert {cost.task for _, cost in recorded_costs(filled, CONFIG)[0]} == {"coarse"}
+
+    def test_what_a_gpu_takes_is_not_known(
+        self, filled: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(run_costs, "probe_seconds", lambda: 0.01)
+        monkeypatch.setattr(run_costs, "ENOUGH_SECONDS", 0.0)
+        stages = {"ingest", "depth", "coarse", "surface", "finetune", "evaluate"}
+        for store in (filled, Store(tmp_path)):
+            for given in ({"device": "cuda"}, {"device": "cpu", "depth.device": "cuda"}):
+                work = Workload(48 * 40, 24, 12, 12, UNTRAINED.with_overrides(given))
+                found = predict_run(store, work, stages)
+                assert "depth" in found.unknown
+                assert {"ingest", "surface"} <= {item.stage for item in found.stages}
+                assert {"coarse", "finetune"}.isdisjoint(found.unknown) == (given["device"] == "cpu")
+            on_processor = Workload(48 * 40, 24, 12, 12, UNTRAINED.with_overrides({"device": "cpu"}))
+            assert predict_run(store, on_processor, stages).unknown == []
+
+    def test_auto_is_what_the_machine_has(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(run_costs, "probe_seconds", lambda: 0.01)
+        monkeypatch.setattr(placement, "_reason_against_cuda", lambda _: "")
+        work = Workload(48 * 40, 24, 12, 12, UNTRAINED)
+        assert predict_run(Store(tmp_path), work, {"ingest", "coarse"}).unknown == ["coarse"]
+
+    def test_records_of_this_gpu_tell_of_it(self, filled: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(run_costs, "ENOUGH_SECONDS", 0.0)
+        monkeypatch.setattr("extrags.devices.device_name", lambda kind: "fast" if kind == "cuda" else kind)
+        on_gpu = [
+            manifest.model_copy(
+                update={
+                    "counts": {**manifest.counts, "device": "fast", "processor_s": 50.0},
+                    "config": {**manifest.config, "device": "cuda"},
+                }
+            )
+            if manifest.stage == "coarse"
+            else manifest
+            for manifest in filled.ls()
+        ]
+        monkeypatch.setattr(Store, "ls", lambda *_: on_gpu)
+        (work,) = (work for work, cost in recorded_costs(filled, UNTRAINED)[1] if cost.task == "coarse")
+        assert work.config.device == "cuda"
+
+        def coarse(device: str) -> float:
+            config = work.config.with_overrides({"device": device})
+            found = predict_run(filled, replace(work, config=config), {"coarse"})
+            return found.processor_seconds
+
+        assert coarse("cuda") == pytest.approx(50)
+        assert coarse("cpu") < 10
+
+    def test_the_tasks_that_run_on_the_device_are_those_that_are_given_one(self) -> None:
+        given = set()
+        for module in iter_modules(tasks.__path__):
+            for task in vars(import_module(f"tasks.{module.name}")).values():
+                if (
+                    isinstance(task, Task)
+                    and "device" in inspect.signature(inspect.unwrap(task.fn)).parameters
+                ):
+                    given.add(task.name)
+        modelled = {task: cost for stage in STAGES for task, cost in modelled_tasks(stage).items()}
+        assert {task for task, cost in modelled.items() if cost.on_device} == given & set(modelled)
 
 
 def test_records_of_gaussians_tell_nothing_of_a_radiance_field(filled: Store) -> None:

@@ -10,7 +10,9 @@ import cloudpickle
 import pytest
 from prefect import Task
 
+from extrags.cores import processor_name
 from extrags.errors import ConfigError, DamagedArtefactError, DivergedError
+from extrags.raster import native_isa
 from extrags.store import Ref, Slot, Store
 from tasks.enhance import restore
 from tasks.finetune import judge
@@ -33,6 +35,9 @@ def test_fn_fills_an_artefact_and_returns_its_ref(tmp_path: Path) -> None:
     peak = manifest.counts["peak_mib"]
     assert isinstance(peak, float)
     assert peak > 10
+    assert manifest.counts["processor"] == processor_name()
+    assert manifest.counts["isa"] == native_isa()
+    assert manifest.counts["device"] == "cpu"
 
 
 def test_a_second_call_does_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
