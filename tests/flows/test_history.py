@@ -227,7 +227,7 @@ class TestRecords:
 
     def test_the_trend_joins_no_figures_of_another_version_of_the_protocol(self) -> None:
         older = {**entry(psnr=25, day=1), "protocol": PROTOCOL_VERSION - 1}
-        # Of entries from before it was on record nobody knows the version: they are drawn, as they are judged.
+        # Of entries from before it was on record nobody knows the version: they are drawn, as judged.
         silent = {key: value for key, value in entry(psnr=19, day=2).items() if key != "protocol"}
         assert [item["methods"]["coarse"] for item in trend([older, silent, entry(psnr=20, day=3)])] == [
             {"psnr": None, "seconds": 100.5},
