@@ -2,34 +2,57 @@
 
 Runs of both results that have everything in common, seed and repeat included, are pairs; a difference is
 judged by the spread of the pairs' differences (one-sided t test). Where seeds or repeats do not match, the
-two samples are compared as they are (Welch's test). Repeats of a seed count once for a figure. As very many
-quantities are looked at, the threshold is Holm's, over all of them: the chance of a single false alarm in a
-comparison is at most `LEVEL`. A difference smaller than what matters (`MATTERS`) is never a regression,
-however certain it is.
+two samples are compared as they are. Repeats of a seed count once for a figure.
+
+Two or three seeds say next to nothing about their own spread, so that no change that ever happens would be
+beyond noise by it. Spreads of a quantity are therefore pooled over all groups of the comparison, and taken
+`UNEQUAL` times as large, because noise differs from sequence to sequence. Elapsed and processor time have the
+noise of the machine as well (`SITTING`), which repeats of one sitting do not show.
+
+As many quantities are looked at, the threshold is Holm's, in two families: costs and whole figures, of which
+a change counts for itself, and figures of parts of the pixels, which say much the same again. The chance of a
+single false alarm in a comparison is at most `LEVEL` for normal noise whose deviation differs up to three
+times between groups. A difference smaller than what matters (`MATTERS`) is never a regression, however
+certain it is; where even `PLAUSIBLE` times as much could not have been told from noise, nothing is judged.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import fmean
 from typing import Any, Literal
 
 import numpy as np
 
 from extrags.errors import ConfigError
-from extrags.metrics.comparison import figure_of, spread
+from extrags.metrics.comparison import figure_of
 from extrags.metrics.registry import Figure, figures
 
-__all__ = ["COST_NAMES", "LEVEL", "MATTERS", "compare_results"]
+__all__ = ["COST_NAMES", "LEVEL", "MATTERS", "SITTING", "compare_results"]
 
 LEVEL = 0.05
 """Chance of a false alarm in a whole comparison."""
+SECONDARY_LEVEL = 0.01
+"""The part of `LEVEL` for figures of parts of the pixels."""
 COST_NAMES = ("seconds", "processor_seconds", "peak_mib")
 MATTERS = {"cost": 0.05, "dB": 0.1, "other": 0.01, "absolute": 0.01}
 """The smallest change that counts: share of a cost, decibels, share of any other figure; of what was 0, which
 has no shares, the change itself."""
+PLAUSIBLE = 10.0
+"""So many times what matters has to be found: a comparison that could not is not said to have found noise."""
+ENOUGH = 5
+"""From so many pairs on a row is judged by its own spread alone."""
+UNEQUAL = 2.0
+"""Pooled deviations are multiplied by this: a group has at most its square root of all groups' number, and of
+groups whose deviations differ three times the noisiest has up to twice the pooled one."""
+SITTING = 0.1
+"""Standard deviation of the logarithm of a machine's speed between two sittings: of one virtual machine it
+changed by a tenth within two hours (docs/algorithms/rasteriser.md)."""
+MANY = 1e9
+"""Degrees of freedom from which Student's t is the normal distribution."""
+TIMES = ("seconds", "processor_seconds")
 UNITS = {"cost": "share", "dB": "dB", "other": "share", "absolute": "absolute"}
 SIZE = ("width", "height")
 GROUP = ("method", "profile", "budget", "sequence", "setting", *SIZE)
@@ -47,25 +70,48 @@ class _Row:
     n: int
     before: float
     after: float
-    worsening: float
-    """In the unit of `kind`: positive is worse."""
-    low: float | None
-    high: float | None
-    p_worse: float | None
-    p_better: float | None
+    primary: bool
+    """Judged in the first family."""
+    logarithms: bool
+    """`change` is of logarithms."""
+    change: float
+    """Mean difference; positive is worse."""
+    variance: float | None
+    """Of single differences, or of the runs of a side; None where there is one."""
+    freedom: int
+    share: float
+    """The variance of `change` is so many times that of single differences."""
+    low: float | None = None
+    high: float | None = None
+    p_worse: float | None = None
+    p_better: float | None = None
+    least: float = math.inf
+    """The smallest change that could have been told from noise, as `change`."""
     verdict: Verdict = "not judged"
+
+    @property
+    def worsening(self) -> float:
+        """In the unit of `kind`: positive is worse."""
+        return self.in_unit(self.change)
+
+    def in_unit(self, change: float) -> float:
+        """A change of logarithms as a share."""
+        return math.expm1(change) if self.logarithms else change
 
     def to_json(self) -> dict[str, Any]:
         return {
             **self.about,
             "quantity": self.quantity,
+            "primary": self.primary,
             "unit": UNITS[self.kind],
             "paired": self.paired,
             "n": self.n,
             "before": self.before,
             "after": self.after,
             "worsening": self.worsening,
-            "interval": None if self.low is None else [self.low, self.high],
+            "interval": None
+            if self.low is None or self.high is None
+            else [self.in_unit(self.low), self.in_unit(self.high)],
             "verdict": self.verdict,
         }
 
@@ -78,16 +124,18 @@ def compare_results(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict
         after: of what is judged.
 
     Returns:
-        `{level, times_judged, protocols, rows, failed, missing, regressions}`. A row has what its runs
-        share, the quantity, means, the worsening (share of a cost or figure, or dB; `absolute`, in its own
-        unit, of what was 0; positive is worse), its 95 % interval and a verdict: `worse`, `better`, `noise`,
-        `equal`, or `not judged` where a single pair says nothing about noise. `failed` names groups of
+        `{level, times_judged, protocols, rows, failed, missing, regressions, not_judged}`. A row has what its
+        runs share, the quantity, whether it is of the first family (`primary`), means, the worsening (share
+        of a cost or figure, or dB; `absolute`, in its own unit, of what was 0; positive is worse), its 95 %
+        interval and a verdict: `worse`, `better`, `noise`, `equal`, or `not judged` where seeds are too few
+        to tell a change of `PLAUSIBLE` times what matters from noise. `failed` names groups of
         runs that fail now and did not; `missing` those that are not in `after`, wholly or with a seed or
         repeat, and figures that no run there has any more. Times and memory are judged on one kind of
         machine only, figures by one version of the evaluation protocol: of another, the same renders may have
         other ones.
         `protocols` has both versions, null for results that say none, whose figures are judged.
-        `regressions` has the rows that are worse, and what fails or is missing, in words.
+        `regressions` has the rows that are worse, and what fails or is missing, in words; `not_judged` the
+        primary rows that seem worse by more than matters and could not be judged.
 
     Raises:
         ConfigError: for a document that is no such result, or two that have no group in common.
@@ -125,6 +173,11 @@ def compare_results(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict
         "failed": failed,
         "missing": missing,
         "regressions": [*failed, *missing, *worse],
+        "not_judged": [
+            _words(row)
+            for row in rows
+            if row.primary and row.verdict == "not judged" and row.worsening >= MATTERS[row.kind]
+        ],
     }
 
 
@@ -263,7 +316,7 @@ def _rows(
     found = []
     for name, kind, figure in wanted:
         sides = [_values(runs, name, figure) for runs in (was, now)]
-        if not all(sides):
+        if not all(sides) or _says_it_again(figure, sides, was, now):
             continue
         shared = [key for key in sides[0] if key in sides[1]]
         paired = len(shared) == max(len(sides[0]), len(sides[1])) or len(shared) > 1
@@ -286,6 +339,29 @@ def _values(runs: Sequence[Mapping[str, Any]], name: str, figure: Figure | None)
     return {key: fmean(values) for key, values in found.items()}
 
 
+def _says_it_again(
+    figure: Figure | None,
+    sides: Sequence[Mapping[Any, float]],
+    was: Sequence[Mapping[str, Any]],
+    now: Sequence[Mapping[str, Any]],
+) -> bool:
+    """Whether it is of all pixels where the mask is full: the overall figure under another name."""
+    if figure is None or figure.name != f"whole.{figure.key}":
+        return False
+    return list(sides) == [_values(runs, figure.key, replace(figure, name=figure.key)) for runs in (was, now)]
+
+
+def _is_primary(figure: Figure | None) -> bool:
+    """Costs, and the figures of all valid pixels and of the surface that tables show.
+
+    Others are of parts of these pixels, with one gain per view, or other measures of the same errors.
+    """
+    return figure is None or (
+        figure.name in {shown.name for shown in figures("differences") if "." not in shown.name}
+        or figure.name in {shown.name for shown in figures("counts")}
+    )
+
+
 def _repetition(run: Mapping[str, Any]) -> tuple[Any, ...]:
     return run["seed"], run.get("repeat", 0)
 
@@ -298,8 +374,6 @@ def _row(
     paired: bool,
     samples: Sequence[Sequence[float]],
 ) -> _Row:
-    from scipy.stats import t
-
     sign = -1.0 if figure is not None and figure.higher_is_better else 1.0
     before, after = (np.asarray(sample, dtype=np.float64) for sample in samples)
     # Costs are multiplied by what slows a machine: they are compared as shares, by their logarithms.
@@ -311,33 +385,10 @@ def _row(
     else:
         scale = 1.0 if kind in ("dB", "absolute") else abs(float(before.mean()))
         x, y = before / scale, after / scale
-    low = high = worse = better = None
-    if paired:
-        difference = sign * (y - x)
-        of = spread(list(difference))
-        mean, n = of.mean, of.n
-        if of.deviation is not None:
-            low, high = of.low, of.high
-            error = of.deviation / math.sqrt(n)
-            freedom = float(n - 1)
-    else:
-        n = min(len(x), len(y))
-        mean = sign * float(y.mean() - x.mean())
-        if n > 1:
-            parts = [float(sample.var(ddof=1)) / len(sample) for sample in (x, y)]
-            error = math.sqrt(sum(parts))
-            below = sum(part**2 / (len(sample) - 1) for part, sample in zip(parts, (x, y), strict=True))
-            freedom = error**4 / below if below > 0 else float(n - 1)
-            reach = float(t.ppf(0.975, freedom)) * error
-            low, high = mean - reach, mean + reach
-    if low is not None:
-        # What is the same in every pair is certain, with whatever sign.
-        statistic = mean / error if error > 0 else math.copysign(math.inf, mean) if mean else 0.0
-        worse, better = float(t.sf(statistic, freedom)), float(t.cdf(statistic, freedom))
-
-    def share(value: float | None) -> float | None:
-        return None if value is None else math.expm1(value) if logarithms else value
-
+    parts = [sign * (y - x)] if paired else [x, y]
+    freedom = sum(len(part) - 1 for part in parts)
+    squares = sum(float(((part - part.mean()) ** 2).sum()) for part in parts)
+    n = min(map(len, parts))
     return _Row(
         about,
         name,
@@ -346,31 +397,85 @@ def _row(
         n,
         float(before.mean()),
         float(after.mean()),
-        share(mean) or 0.0,
-        share(low),
-        share(high),
-        worse,
-        better,
+        _is_primary(figure),
+        logarithms,
+        float(parts[0].mean()) if paired else sign * float(y.mean() - x.mean()),
+        squares / freedom if n > 1 else None,
+        freedom,
+        sum(1 / len(part) for part in parts),
     )
 
 
 def _judge(rows: Sequence[_Row]) -> None:
-    """Holm's procedure in each direction, then what matters."""
+    """Noise of each row, Holm's procedure in each family and direction, then what matters."""
     for row in rows:
-        if row.p_worse is not None:
-            row.verdict = "noise"
-        if row.worsening == 0.0 and row.before == row.after and (row.low in (None, 0.0)):
+        if row.worsening == 0.0 and row.before == row.after and not row.variance:
             row.verdict = "equal"
-    # Over all that could be judged: to look only at what has changed by enough would be to look at the data
-    # first, and to be content with fewer quantities than were looked at.
-    tested = [row for row in rows if row.p_worse is not None]
+    tested = [row for row in rows if row.variance is not None]
+    pools: dict[tuple[Any, ...], list[_Row]] = {}
+    for row in tested:
+        pools.setdefault((row.quantity, row.kind, row.paired, row.logarithms), []).append(row)
+    for alike in pools.values():
+        # Over all that could be judged: to look only at what has changed by enough would be to look at the
+        # data first, and to be content with fewer quantities than were looked at.
+        primary = alike[0].primary
+        level = _level(primary) / sum(row.primary == primary for row in tested)
+        for row in alike:
+            _measure(row, alike, level)
+    for primary in (True, False):
+        _holm([row for row in tested if row.primary == primary], _level(primary))
+
+
+def _level(primary: bool) -> float:
+    return LEVEL - SECONDARY_LEVEL if primary else SECONDARY_LEVEL
+
+
+def _measure(row: _Row, alike: Sequence[_Row], level: float) -> None:
+    """Probabilities of the change of a row by chance, its interval, and what could have been found.
+
+    Args:
+        row: with at least two pairs, or runs a side; filled in.
+        alike: rows of its quantity that can be judged, itself among them: their noise is pooled.
+        level: of its family, divided by the number of rows there.
+    """
+    from scipy.special import stdtr, stdtrit
+
+    own = row.variance or 0.0
+    if row.n >= ENOUGH or len(alike) == 1:
+        variance, freedom = own, float(row.freedom)
+    else:
+        freedom = float(sum(other.freedom for other in alike))
+        pooled = sum((other.variance or 0.0) * other.freedom for other in alike) / freedom
+        variance = max(own, pooled * min(UNEQUAL**2, len(alike)))
+    square = variance * row.share
+    if row.quantity in TIMES:
+        # Of known size, so that it adds degrees of freedom (Satterthwaite).
+        whole = square + SITTING**2
+        freedom *= (whole / square) ** 2 if square > 0 else math.inf
+        square = whole
+    error, freedom = math.sqrt(square), min(freedom, MANY)
+    reach = float(stdtrit(freedom, 0.975)) * error
+    row.low, row.high = row.change - reach, row.change + reach
+    row.least = -float(stdtrit(freedom, level)) * error
+    # What is the same in every pair is certain, with whatever sign.
+    statistic = (
+        row.change / error if error > 0 else math.copysign(math.inf, row.change) if row.change else 0.0
+    )
+    row.p_worse, row.p_better = float(stdtr(freedom, -statistic)), float(stdtr(freedom, statistic))
+
+
+def _holm(tested: Sequence[_Row], level: float) -> None:
+    """Holm's procedure in each direction; what it leaves is noise where a plausible change would be found."""
+    for row in tested:
+        if row.verdict != "equal" and row.in_unit(row.least) <= PLAUSIBLE * MATTERS[row.kind]:
+            row.verdict = "noise"
     directions: tuple[tuple[str, Verdict, float], ...] = (
         ("p_worse", "worse", 1.0),
         ("p_better", "better", -1.0),
     )
     for attribute, verdict, sign in directions:
         for rank, row in enumerate(sorted(tested, key=lambda row: float(getattr(row, attribute)))):
-            if getattr(row, attribute) > LEVEL / (len(tested) - rank):
+            if getattr(row, attribute) > level / (len(tested) - rank):
                 break
             if sign * row.worsening >= MATTERS[row.kind]:
                 row.verdict = verdict
@@ -382,7 +487,7 @@ def _words(row: _Row) -> str:
 
     interval = ""
     if row.low is not None and row.high is not None:
-        interval = f" [{amount(row.low)} to {amount(row.high)}]"
+        interval = f" [{amount(row.in_unit(row.low))} to {amount(row.in_unit(row.high))}]"
     return (
         f"{_label(tuple(row.about.values()))}: {row.quantity} {row.before:.4g} to {row.after:.4g}, worse by "
         f"{amount(row.worsening)}{interval}, {row.n} {'pairs' if row.paired else 'runs a side'}"
