@@ -30,7 +30,17 @@ from extrags.errors import ConfigError
 from extrags.metrics.comparison import figure_of
 from extrags.metrics.registry import Figure, figures
 
-__all__ = ["COST_NAMES", "LEVEL", "MATTERS", "SITTING", "compare_results"]
+__all__ = [
+    "COST_NAMES",
+    "GROUP",
+    "LEVEL",
+    "MATTERS",
+    "SITTING",
+    "compare_results",
+    "grouped_runs",
+    "known_sizes",
+    "repetition",
+]
 
 LEVEL = 0.05
 """Chance of a false alarm in a whole comparison."""
@@ -56,6 +66,7 @@ TIMES = ("seconds", "processor_seconds")
 UNITS = {"cost": "share", "dB": "dB", "other": "share", "absolute": "absolute"}
 SIZE = ("width", "height")
 GROUP = ("method", "profile", "budget", "sequence", "setting", *SIZE)
+"""What runs have in common that differ in seed and repeat alone."""
 MACHINE = ("processor", "cores", "threads", "isa")
 
 Verdict = Literal["worse", "better", "noise", "equal", "not judged"]
@@ -141,8 +152,8 @@ def compare_results(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict
         ConfigError: for a document that is no such result, or two that have no group in common.
     """
     found = [_cases(before, "the first result"), _cases(after, "the second result")]
-    sizes = [_sizes(cases) for cases in found]
-    sides = [_grouped(found[0], sizes), _grouped(found[1], sizes[::-1])]
+    sizes = [known_sizes(cases) for cases in found]
+    sides = [grouped_runs(found[0], sizes), grouped_runs(found[1], sizes[::-1])]
     common = [group for group in sides[0] if group in sides[1]]
     if not common:
         raise ConfigError("the two results have no method, budget, sequence and size of images in common")
@@ -223,7 +234,7 @@ def _is_case(case: Any, known: Sequence[str]) -> bool:
     )
 
 
-def _sizes(cases: Sequence[Mapping[str, Any]]) -> dict[tuple[Any, ...], set[tuple[Any, ...]]]:
+def known_sizes(cases: Sequence[Mapping[str, Any]]) -> dict[tuple[Any, ...], set[tuple[Any, ...]]]:
     """The sizes of images of all runs that have something in common but these."""
     found: dict[tuple[Any, ...], set[tuple[Any, ...]]] = {}
     for case in cases:
@@ -243,14 +254,17 @@ def _but_size(case: Mapping[str, Any]) -> tuple[Any, ...]:
     return tuple(case.get(key) for key in GROUP if key not in SIZE)
 
 
-def _grouped(
+def grouped_runs(
     cases: Sequence[Mapping[str, Any]], sizes: Sequence[Mapping[tuple[Any, ...], set[tuple[Any, ...]]]]
 ) -> dict[tuple[Any, ...], list[Mapping[str, Any]]]:
-    """Runs by what they have in common.
+    """Runs by what they have in common (`GROUP`).
+
+    A run that failed before the size of its frames was known counts as one of the size that the other runs
+    have, if it is one.
 
     Args:
         cases: of one result.
-        sizes: from `_sizes`, of the same result and of the other one.
+        sizes: from `known_sizes`, of the same result and of the other one.
     """
     found: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
     for case in cases:
@@ -266,17 +280,17 @@ def _grouped(
 
 def _new_failure(was: Sequence[Mapping[str, Any]], now: Sequence[Mapping[str, Any]]) -> str | None:
     """The error of a run that fails and did not; of one that was not run before, if none failed."""
-    before = {_repetition(run): bool(run["error"]) for run in was}
+    before = {repetition(run): bool(run["error"]) for run in was}
     unstable = any(before.values())
     for run in now:
-        if run["error"] and not before.get(_repetition(run), unstable):
+        if run["error"] and not before.get(repetition(run), unstable):
             return str(run["error"])
     return None
 
 
 def _gone(was: Sequence[Mapping[str, Any]], now: Sequence[Mapping[str, Any]]) -> list[str]:
     """Seeds and repeats that are not there any more, in words; none where all of them are other ones."""
-    before, after = ({_repetition(run) for run in runs} for runs in (was, now))
+    before, after = ({repetition(run) for run in runs} for runs in (was, now))
     if not before & after:
         return []
     repeated = any(repeat for _, repeat in before)
@@ -334,7 +348,7 @@ def _values(runs: Sequence[Mapping[str, Any]], name: str, figure: Figure | None)
     for run in runs:
         value = run.get(name) if figure is None else figure_of(run["metrics"], figure.name)
         if not run["error"] and value is not None and math.isfinite(value):
-            key = _repetition(run) if figure is None else run["seed"]
+            key = repetition(run) if figure is None else run["seed"]
             found.setdefault(key, []).append(float(value))
     return {key: fmean(values) for key, values in found.items()}
 
@@ -362,7 +376,8 @@ def _is_primary(figure: Figure | None) -> bool:
     )
 
 
-def _repetition(run: Mapping[str, Any]) -> tuple[Any, ...]:
+def repetition(run: Mapping[str, Any]) -> tuple[Any, ...]:
+    """Seed and repeat of a run."""
     return run["seed"], run.get("repeat", 0)
 
 

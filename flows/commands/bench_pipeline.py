@@ -175,6 +175,10 @@ def grid_markdown(found: dict[str, Any]) -> str:
             row.append(f"**{text}**" if (*_identity(cell), figure.name) in on else text)
         lines.append(f"| {' | '.join(row)} |")
     lines += ["", "Bold: on the front of this figure against processor time, within its sequence and size."]
+    if any(entry["left_off"] for entry in found["fronts"]):
+        lines += [
+            "What failed with a seed or repeat that others have is on no front: its means are of fewer runs."
+        ]
     failed = [case for case in found["cases"] if case["error"]]
     lines += [""] * bool(failed)
     for case in failed:
