@@ -135,7 +135,8 @@ def compare_results(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict
         after: of what is judged.
 
     Returns:
-        `{level, times_judged, protocols, rows, failed, missing, regressions, not_judged}`. A row has what its
+        `{level, times_judged, memory_judged, protocols, other_settings, rows, failed, missing, regressions,
+        not_judged}`. A row has what its
         runs share, the quantity, whether it is of the first family (`primary`), means, the worsening (share
         of a cost or figure, or dB; `absolute`, in its own unit, of what was 0; positive is worse), its 95 %
         interval and a verdict: `worse`, `better`, `noise`, `equal`, or `not judged` where seeds are too few
@@ -144,6 +145,10 @@ def compare_results(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict
         repeat, and figures that no run there has any more. Times and memory are judged on one kind of
         machine only, figures by one version of the evaluation protocol: of another, the same renders may have
         other ones.
+        Memory is not judged either where runs of one result shared stages and those of the other did not
+        (`sharing`): who finds a stage made has not its peak. `other_settings` names groups whose runs were
+        asked for with other settings, though they are called alike, as variants may be: what they
+        differ in may be why.
         `protocols` has both versions, null for results that say none, whose figures are judged.
         `regressions` has the rows that are worse, and what fails or is missing, in words; `not_judged` the
         primary rows that seem worse by more than matters and could not be judged.
@@ -161,15 +166,21 @@ def compare_results(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict
         (before.get("machine") or {}).get(key) == (after.get("machine") or {}).get(key) for key in MACHINE
     )
     protocols = [_protocol(document) for document in (before, after)]
+    sharing = [document.get("sharing") for document in (before, after)]
+    same_sharing = None in sharing or sharing[0] == sharing[1]
     one_protocol = None in protocols or protocols[0] == protocols[1]
     rows: list[_Row] = []
     failed = []
+    other_settings = []
     missing = [f"{_label(group)} was not run" for group in sides[0] if group not in sides[1]]
     for group in common:
         was, now = (side[group] for side in sides)
         if (error := _new_failure(was, now)) is not None:
             failed.append(f"{_label(group)} fails: {error}")
-        rows += _rows(group, was, now, costs=same, with_figures=one_protocol)
+        costs = [name for name in COST_NAMES if same and (same_sharing or name != "peak_mib")]
+        rows += _rows(group, was, now, costs=costs, with_figures=one_protocol)
+        if told := _other_settings(group, (was, before), (now, after)):
+            other_settings.append(told)
         if gone := _gone(was, now):
             missing.append(f"{_label(group)} was not run with {'; '.join(gone)}")
         if one_protocol:
@@ -179,7 +190,9 @@ def compare_results(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict
     return {
         "level": LEVEL,
         "times_judged": same,
+        "memory_judged": same and same_sharing,
         "protocols": protocols,
+        "other_settings": other_settings,
         "rows": [row.to_json() for row in rows],
         "failed": failed,
         "missing": missing,
@@ -206,8 +219,9 @@ def _cases(document: Mapping[str, Any], which: str) -> list[Mapping[str, Any]]:
             f"{which} is no JSON of `bench pipeline` or `benchmark`: its `cases` lack fields, or have others "
             "in their place"
         )
-    if not isinstance(document.get("machine") or {}, Mapping):
-        raise ConfigError(f"{which} is no JSON of `bench pipeline` or `benchmark`: `machine` is no object")
+    for name in ("machine", "methods"):
+        if not isinstance(document.get(name) or {}, Mapping):
+            raise ConfigError(f"{which} is no JSON of `bench pipeline` or `benchmark`: `{name}` is no object")
     return cases
 
 
@@ -278,6 +292,42 @@ def grouped_runs(
     return found
 
 
+def _other_settings(
+    group: tuple[Any, ...], *sides: tuple[Sequence[Mapping[str, Any]], Mapping[str, Any]]
+) -> str:
+    """What tells that the runs of a group were asked for with other settings, in words; empty for nothing.
+
+    Args:
+        group: what the runs have in common.
+        sides: its runs in each result, and the result.
+    """
+    asked = [{run.get("asked") for run in runs} for runs, _ in sides]
+    variants = [str((document.get("methods") or {}).get(group[0], "")) for _, document in sides]
+    given = [_given(runs) for runs, _ in sides]
+    if any(None in digests for digests in asked):
+        # Earlier results have words alone; those of a method may be worded anew, those of a variant say
+        # what it changes.
+        differs = (all(" = " in words for words in variants) and variants[0] != variants[1]) or (
+            all(given) and given[0] != given[1]
+        )
+    else:
+        differs = asked[0] != asked[1]
+    if not differs:
+        return ""
+    told = [f"{was or 'nothing'}, now {now or 'nothing'}" for was, now in (variants, given) if was != now]
+    return f"{_label(group)} was asked for with other settings{': ' if told else ''}{'; '.join(told)}"
+
+
+def _given(runs: Sequence[Mapping[str, Any]]) -> str:
+    """Settings that were given beside the profile, in words; empty where it is not known."""
+    found = {
+        ", ".join(f"{name} = {value}" for name, value in sorted(run["settings"].items()))
+        for run in runs
+        if isinstance(run.get("settings"), Mapping)
+    }
+    return " or ".join(sorted(found))
+
+
 def _new_failure(was: Sequence[Mapping[str, Any]], now: Sequence[Mapping[str, Any]]) -> str | None:
     """The error of a run that fails and did not; of one that was not run before, if none failed."""
     before = {repetition(run): bool(run["error"]) for run in was}
@@ -318,13 +368,11 @@ def _rows(
     was: Sequence[Mapping[str, Any]],
     now: Sequence[Mapping[str, Any]],
     *,
-    costs: bool,
+    costs: Sequence[str],
     with_figures: bool,
 ) -> list[_Row]:
     about = dict(zip(GROUP, group, strict=True))
-    wanted: list[tuple[str, str, Figure | None]] = []
-    if costs:
-        wanted += [(name, "cost", None) for name in COST_NAMES]
+    wanted: list[tuple[str, str, Figure | None]] = [(name, "cost", None) for name in costs]
     if with_figures:
         wanted += [(figure.name, "dB" if figure.unit == "dB" else "other", figure) for figure in figures()]
     found = []

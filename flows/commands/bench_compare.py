@@ -88,8 +88,12 @@ def _print(found: dict[str, Any], *, every: bool) -> None:
         out.print(table)
     for line in (*found["failed"], *found["missing"]):
         out.print(line, markup=False, soft_wrap=True)
+    for line in found["other_settings"]:
+        out.print(line, markup=False, soft_wrap=True)
     if not found["times_judged"]:
         out.print("times and memory are not judged: the results are of different machines")
+    elif not found["memory_judged"]:
+        out.print("memory is not judged: runs shared stages in one of the results only", soft_wrap=True)
     before, after = found["protocols"]
     if None not in (before, after) and before != after:
         out.print(

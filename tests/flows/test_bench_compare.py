@@ -52,6 +52,14 @@ def test_nothing_worse_is_all_well(tmp_path: Path) -> None:
     assert compared(tmp_path, result(30.0, 31.0), result(30.0, 31.0)) == 0
 
 
+def test_what_is_not_alike_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = result(30.0, case={"asked": "a"}, sharing="none")
+    assert compared(tmp_path, before, result(30.0, case={"asked": "b"}, sharing="once")) == 0
+    said = capsys.readouterr().out
+    assert "coarse (quick) on phantom/0@sparse was asked for with other settings" in said
+    assert "memory is not judged" in said
+
+
 def test_a_regression_comes_first(tmp_path: Path) -> None:
     losing = result(*(20.0 + seed / 100 for seed in range(5)))
     assert compared(tmp_path, result(*(30.0 + seed for seed in range(5))), losing) == 1

@@ -268,6 +268,43 @@ class TestPowerAtRealSize:
         assert "whole.ssim" in quantities
 
 
+class TestWhatIsNotAlike:
+    def asked(self, side: dict[str, Any], **known: Any) -> dict[str, Any]:
+        return {**side, "cases": [{**case, **known} for case in side["cases"]]}
+
+    def test_another_digest_is_told(self) -> None:
+        sides = [
+            self.asked(result(), asked=digest, settings={"coarse.iterations": iterations})
+            for digest, iterations in (("a", 500), ("b", 1500))
+        ]
+        assert compare_results(*sides)["other_settings"] == [
+            "coarse (quick) on phantom/0@sparse was asked for with other settings: "
+            "coarse.iterations = 500, now coarse.iterations = 1500"
+        ]
+        assert compare_results(sides[0], sides[0])["other_settings"] == []
+
+    def test_earlier_results_have_the_words_of_variants(self) -> None:
+        def worded(words: str) -> dict[str, Any]:
+            return {**result(), "methods": {"coarse": words}}
+
+        one, other = (worded(f"coarse with coarse.iterations = {number}") for number in (500, 1500))
+        (line,) = compare_results(one, other)["other_settings"]
+        assert "coarse.iterations = 500, now coarse with coarse.iterations = 1500" in line
+        # A method's description may be worded anew.
+        assert compare_results(worded("as it was"), worded("better said"))["other_settings"] == []
+        assert compare_results(result(), other)["other_settings"] == []
+
+    def test_memory_of_shared_stages_is_not_that_of_separate_ones(self) -> None:
+        before, after = (self.asked(result(), peak_mib=peak) for peak in (500.0, 900.0))
+        shared, separate = {"sharing": "once"}, {"sharing": "none"}
+        found = compare_results(before | shared, after | separate)
+        assert (found["times_judged"], found["memory_judged"]) == (True, False)
+        assert "peak_mib" not in verdicts(found)
+        assert "seconds" in verdicts(found)
+        assert verdicts(compare_results(before | shared, after | shared))["peak_mib"] == "worse"
+        assert verdicts(compare_results(before, after | shared))["peak_mib"] == "worse"
+
+
 def test_runs_that_fail_now_are_a_regression() -> None:
     after = result()
     after["cases"][0]["error"] = "coarse: it diverged"
@@ -421,6 +458,7 @@ def _with(**changes: Any) -> dict[str, Any]:
         {"cases": [1]},
         {"cases": [{"method": "coarse"}]},
         {**result(), "machine": "x"},
+        {**result(), "methods": ["x"]},
         _with(sequence=["phantom/0"]),
         _with(seed={}),
         _with(image_size=[48]),
