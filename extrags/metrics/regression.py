@@ -9,8 +9,14 @@ beyond noise by it. Spreads of a quantity are therefore pooled over all groups o
 `UNEQUAL` times as large, because noise differs from sequence to sequence. Elapsed and processor time have the
 noise of the machine as well (`SITTING`), which repeats of one sitting do not show.
 
-As many quantities are looked at, the threshold is Holm's, in two families: costs and whole figures, of which
-a change counts for itself, and figures of parts of the pixels, which say much the same again. The chance of a
+A method's costs and whole figures are also judged over all of its sequences: there every pair is one of a
+sample, seeds and sequences alike, which finds what is lost by little everywhere. That t test holds however
+unlike the noise of the sequences is (Ibragimov and Mueller 2010, "t-statistic based correlation and
+heterogeneity robust inference").
+
+As many quantities are looked at, the threshold is Holm's, in three families: costs and whole figures, of
+which a change counts for itself, on each sequence and over all, and figures of parts of the pixels, which say
+much the same again. The chance of a
 single false alarm in a comparison is at most `LEVEL` for normal noise whose deviation differs up to three
 times between groups. A difference smaller than what matters (`MATTERS`) is never a regression, however
 certain it is; where even `PLAUSIBLE` times as much could not have been told from noise, nothing is judged.
@@ -44,8 +50,9 @@ __all__ = [
 
 LEVEL = 0.05
 """Chance of a false alarm in a whole comparison."""
-SECONDARY_LEVEL = 0.01
-"""The part of `LEVEL` for figures of parts of the pixels."""
+LEVELS = {"each": 0.02, "all": 0.02, "parts": 0.01}
+"""Shares of `LEVEL` by family: costs and whole figures on each sequence, over all sequences of a method, and
+figures of parts of the pixels."""
 COST_NAMES = ("seconds", "processor_seconds", "peak_mib")
 MATTERS = {"cost": 0.05, "dB": 0.1, "other": 0.01, "absolute": 0.01}
 """The smallest change that counts: share of a cost, decibels, share of any other figure; of what was 0, which
@@ -92,6 +99,8 @@ class _Row:
     freedom: int
     share: float
     """The variance of `change` is so many times that of single differences."""
+    differences: tuple[float, ...] = ()
+    """Of the pairs, as `change`."""
     low: float | None = None
     high: float | None = None
     p_worse: float | None = None
@@ -99,6 +108,13 @@ class _Row:
     least: float = math.inf
     """The smallest change that could have been told from noise, as `change`."""
     verdict: Verdict = "not judged"
+
+    @property
+    def family(self) -> str:
+        """Key of `LEVELS`."""
+        if not self.primary:
+            return "parts"
+        return "each" if self.about["sequence"] is not None else "all"
 
     @property
     def worsening(self) -> float:
@@ -137,7 +153,8 @@ def compare_results(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict
     Returns:
         `{level, times_judged, memory_judged, protocols, other_settings, rows, failed, missing, regressions,
         not_judged}`. A row has what its
-        runs share, the quantity, whether it is of the first family (`primary`), means, the worsening (share
+        runs share (`sequence` is None over all sequences of a method), the quantity, whether it is a cost or
+        whole figure (`primary`), means, the worsening (share
         of a cost or figure, or dB; `absolute`, in its own unit, of what was 0; positive is worse), its 95 %
         interval and a verdict: `worse`, `better`, `noise`, `equal`, or `not judged` where seeds are too few
         to tell a change of `PLAUSIBLE` times what matters from noise. `failed` names groups of
@@ -185,6 +202,7 @@ def compare_results(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict
             missing.append(f"{_label(group)} was not run with {'; '.join(gone)}")
         if one_protocol:
             missing += [f"{_label(group)} has no {name}" for name in _lost(was, now)]
+    rows += _over_sequences(rows)
     _judge(rows)
     worse = [_words(row) for row in rows if row.verdict == "worse"]
     return {
@@ -466,7 +484,36 @@ def _row(
         squares / freedom if n > 1 else None,
         freedom,
         sum(1 / len(part) for part in parts),
+        tuple(parts[0].tolist()) if paired else (),
     )
+
+
+def _over_sequences(rows: Sequence[_Row]) -> list[_Row]:
+    """Costs and whole figures of each method, profile and budget over all its sequences."""
+    samples: dict[tuple[Any, ...], list[_Row]] = {}
+    for row in rows:
+        if row.primary and row.paired:
+            what = (*(row.about[key] for key in ("method", "profile", "budget")), row.quantity, row.kind)
+            samples.setdefault((*what, row.logarithms), []).append(row)
+    found = []
+    for inside in samples.values():
+        if len(inside) < 2:
+            continue
+        pairs = np.concatenate([row.differences for row in inside])
+        found.append(
+            replace(
+                inside[0],
+                about={**inside[0].about, **dict.fromkeys(("sequence", "setting", *SIZE))},
+                n=len(pairs),
+                before=fmean(row.before for row in inside),
+                after=fmean(row.after for row in inside),
+                change=float(pairs.mean()),
+                variance=float(pairs.var(ddof=1)),
+                freedom=len(pairs) - 1,
+                share=1 / len(pairs),
+            )
+        )
+    return found
 
 
 def _judge(rows: Sequence[_Row]) -> None:
@@ -477,20 +524,17 @@ def _judge(rows: Sequence[_Row]) -> None:
     tested = [row for row in rows if row.variance is not None]
     pools: dict[tuple[Any, ...], list[_Row]] = {}
     for row in tested:
-        pools.setdefault((row.quantity, row.kind, row.paired, row.logarithms), []).append(row)
+        pool = (row.family, row.quantity, row.kind, row.paired, row.logarithms)
+        pools.setdefault(pool, []).append(row)
     for alike in pools.values():
         # Over all that could be judged: to look only at what has changed by enough would be to look at the
         # data first, and to be content with fewer quantities than were looked at.
-        primary = alike[0].primary
-        level = _level(primary) / sum(row.primary == primary for row in tested)
+        family = alike[0].family
+        level = LEVELS[family] / sum(row.family == family for row in tested)
         for row in alike:
             _measure(row, alike, level)
-    for primary in (True, False):
-        _holm([row for row in tested if row.primary == primary], _level(primary))
-
-
-def _level(primary: bool) -> float:
-    return LEVEL - SECONDARY_LEVEL if primary else SECONDARY_LEVEL
+    for family, level in LEVELS.items():
+        _holm([row for row in tested if row.family == family], level)
 
 
 def _measure(row: _Row, alike: Sequence[_Row], level: float) -> None:
@@ -504,7 +548,7 @@ def _measure(row: _Row, alike: Sequence[_Row], level: float) -> None:
     from scipy.special import stdtr, stdtrit
 
     own = row.variance or 0.0
-    if row.n >= ENOUGH or len(alike) == 1:
+    if row.n >= ENOUGH or len(alike) == 1 or row.family == "all":
         variance, freedom = own, float(row.freedom)
     else:
         freedom = float(sum(other.freedom for other in alike))
@@ -562,5 +606,5 @@ def _label(group: tuple[Any, ...]) -> str:
     size = f", {width}x{height}" if width else ""
     return (
         f"{method} ({profile}{f', {budget}' if budget and budget != 'profile' else ''}) on "
-        f"{sequence}{f'@{setting}' if setting else ''}{size}"
+        f"{sequence or 'all sequences'}{f'@{setting}' if setting else ''}{size}"
     )

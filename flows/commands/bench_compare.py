@@ -69,7 +69,7 @@ def _print(found: dict[str, Any], *, every: bool) -> None:
     for row in found["rows"]:
         counts[row["verdict"]] = counts.get(row["verdict"], 0) + 1
         if row["verdict"] in ("worse", "better") or every:
-            name = f"{row['sequence']}@{row['setting']}" if row["setting"] else row["sequence"]
+            name = f"{row['sequence']}@{row['setting']}" if row["setting"] else row["sequence"] or "all"
             changes = {"dB": "{:+.2f} dB", "share": "{:+.1%}", "absolute": "{:+.4g}"}
             change = changes[row["unit"]].format(row["worsening"])
             table.add_row(
