@@ -24,8 +24,9 @@ def add_arguments(parser: Parser) -> None:
         "where there are such, else the two samples. A difference is a regression when it matters (costs "
         "5 %, 0.1 dB, other figures 1 %) and is beyond noise (t test with the noise of all sequences and "
         "methods, Holm's correction, 5 %; times also beyond what a machine's speed changes between two "
-        "sittings); it takes two or more seeds, or repeats for costs. Times and memory are judged on "
-        "one kind of machine only, figures by one version of the evaluation protocol only. "
+        "sittings); it takes two or more seeds, or several sequences, or repeats for costs. Times and "
+        "memory are judged on one kind of machine only, figures by one version of the evaluation protocol "
+        "only. "
         "Exit code 1 on a regression, or when runs fail that did not, or runs or figures are gone; "
         f"{NOT_JUDGED} when nothing is, but seeds are too few to judge what seems worse."
     )
