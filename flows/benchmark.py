@@ -124,7 +124,7 @@ def benchmark(
 
     Returns:
         `{machine, protocol, methods: {NAME: WORDS}, cases: [{method, profile, sequence, setting, seed,
-        settings, image_size, seconds, spent_seconds, processor_seconds, peak_mib, metrics, ...}],
+        asked, settings, image_size, seconds, spent_seconds, processor_seconds, peak_mib, metrics, ...}],
         comparison, regressions, not_judged, report}`; `metrics` is None for a failed run, whose `error`
         says why. `regressions` and `not_judged` are those of `flows.history.Judgement`, in words.
         `comparison` is
@@ -403,13 +403,13 @@ def run_method(
 def case_of(case: Case) -> dict[str, Any]:
     """A run as JSON.
 
-    `seconds` is what its stages took when they were made, without evaluation and report, `processor_seconds`
-    the processor time of all threads meanwhile (None where an earlier version made one of them),
-    `spent_seconds` the part of `seconds` that was spent in this run, more where something was damaged and
-    made again; `peak_mib` is the largest resident memory of the process; `evaluation` where the figures of
-    each view are; `settings` those that were given for its sequence beside the profile, and `image_size`
-    width and height in px;
-    `held_out_trained_on` is true of the oracle alone.
+    `seconds` is what its stages took when they were made, without evaluation and report,
+    `processor_seconds` the processor time of all threads meanwhile (None where an earlier version made one
+    of them), `spent_seconds` the part of `seconds` that was spent in this run, more where something was
+    damaged and made again; `asked` is the digest of the method and the settings that were asked for;
+    `peak_mib` is the largest resident memory of the process; `evaluation` where the figures of each view
+    are; `settings` those that were given for its sequence beside the profile, and `image_size` width and
+    height in px; `held_out_trained_on` is true of the oracle alone.
     """
     outcome = case.outcome
     rows = [row for row in outcome.stages if row.stage not in NOT_COUNTED]
@@ -424,6 +424,7 @@ def case_of(case: Case) -> dict[str, Any]:
         "sequence": name,
         "setting": setting or None,
         "seed": case.seed,
+        "asked": case.asked,
         "settings": without_credentials_in(case.given),
         "image_size": case.image_size,
         "seconds": round(sum(row.made_seconds for row in rows), 3),

@@ -70,7 +70,8 @@ EXAMPLES = """examples:
   extrags cache rm 'explore*'
 
 A sequence is DATASET/SEQUENCE[@SETTING] (see `extrags data list`) or the path of a folder or a video.
-Exit codes: 0 all well, 1 a sequence failed, 2 wrong usage, 130 interrupted, 143 terminated."""
+Exit codes: 0 all well, 1 a sequence failed, 2 wrong usage, 3 too few seeds to judge (bench compare), 130
+interrupted, 143 terminated."""
 
 
 def parser(verb: str | None = None) -> Parser:

@@ -189,7 +189,7 @@ def judge(entry: Mapping[str, Any], earlier: Sequence[Mapping[str, Any]], tolera
     remark = f"of {len(earlier)} earlier runs comparable (at least {tolerance.at_least})"
     before = [_comparable(item, entry) for item in earlier]
     same = [_same_machine(item, entry) for item in earlier]
-    alike = [item.get("protocol") in (None, entry.get("protocol")) for item in earlier]
+    alike = [_same_protocol(item, entry) for item in earlier]
     for group, now in _comparable(entry, entry).items():
         label = _label(group)
         past = [groups[group] for groups in before if group in groups]
@@ -244,7 +244,7 @@ def trend(entries: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         `{when, commit, version, methods: {METHOD: {psnr, seconds}}}` of each entry: means over all profiles,
         sequences, settings and seeds that did not fail in the last entry. A method that lacks one of them,
         or failed there, is left out of an entry: a mean over others would be another figure. Run times of
-        other kinds of machines are None.
+        other kinds of machines are None, and so is PSNR of another version of the evaluation protocol.
     """
     if not entries:
         return []
@@ -257,13 +257,14 @@ def trend(entries: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     drawn = []
     for entry in entries:
         found = _comparable(entry, last)
+        measured_alike = _same_protocol(entry, last)
         methods: dict[str, dict[str, float | None]] = {}
         for method, groups in wanted.items():
             if any(group not in found or found[group]["error"] for group in groups):
                 continue
             psnr = [found[group]["figures"].get(name) for group, name in groups.items() if name is not None]
             methods[method] = {
-                "psnr": _mean(psnr) if psnr else None,
+                "psnr": _mean(psnr) if psnr and measured_alike else None,
                 "seconds": fmean(found[group]["seconds"] for group in groups)
                 if _same_machine(entry, last)
                 else None,
@@ -327,3 +328,8 @@ def _label(group: tuple[str, ...]) -> str:
 
 def _same_machine(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
     return all(one["machine"].get(key) == other["machine"].get(key) for key in SAME_MACHINE)
+
+
+def _same_protocol(earlier: Mapping[str, Any], entry: Mapping[str, Any]) -> bool:
+    """Whether figures are of one version of the evaluation protocol; earlier entries may not say theirs."""
+    return earlier.get("protocol") in (None, entry.get("protocol"))

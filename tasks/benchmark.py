@@ -21,7 +21,7 @@ PER_VIEW_FILE = "per_view.json"
 
 # `rows` holds times and memory of the runs, `history` those of earlier ones. The page shows them, but they
 # are not part of its cache key; a run that measures anew makes its page anew as well.
-@stage("benchmark-report", version=10, ignore=("rows", "history"))
+@stage("benchmark-report", version=11, ignore=("rows", "history"))
 def benchmark_report(
     slot: Slot,
     name: str,

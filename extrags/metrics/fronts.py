@@ -8,6 +8,7 @@ from typing import Any
 
 from extrags.metrics.comparison import figure_of
 from extrags.metrics.registry import Figure, figures
+from extrags.metrics.regression import GROUP, grouped_runs, known_sizes, repetition
 
 __all__ = ["COSTS", "front_of", "fronts", "means_by_cell"]
 
@@ -46,15 +47,14 @@ def means_by_cell(cases: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Means over seeds and repeats of every cell that has figures.
 
     Returns:
-        `{sequence, setting, width, height, method, profile, budget, runs, failed, seconds,
+        `{sequence, setting, width, height, method, profile, budget, runs, failed, repetitions, seconds,
         processor_seconds, peak_mib, figures: {NAME: mean}}`; a cost or figure that a run lacks is None or
-        left out. Failed runs do not count towards means.
+        left out. Failed runs do not count towards means; `repetitions` has seed and repeat of those that do.
+        Runs that failed before the size of their frames was known belong to the cell of the other runs.
     """
-    grouped: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
-    for case in cases:
-        grouped.setdefault(tuple(case[name] for name in CELL), []).append(case)
     found = []
-    for key, runs in grouped.items():
+    for group, runs in grouped_runs(cases, [known_sizes(cases)]).items():
+        about = dict(zip(GROUP, group, strict=True))
         good = [run for run in runs if run["metrics"] is not None]
         costs = {cost: _mean([run[cost] for run in good]) for cost in COSTS}
         values = {
@@ -63,9 +63,10 @@ def means_by_cell(cases: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         }
         found.append(
             {
-                **dict(zip(CELL, key, strict=True)),
+                **{name: about[name] for name in CELL},
                 "runs": len(good),
                 "failed": len(runs) - len(good),
+                "repetitions": sorted(list(repetition(run)) for run in good),
                 **costs,
                 "figures": {name: value for name, value in values.items() if value is not None},
             }
@@ -76,22 +77,31 @@ def means_by_cell(cases: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 def fronts(cells: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """The front of every scene, cost and figure of the evaluation protocol.
 
+    Means are compared over the same runs: a cell that lacks a seed or repeat that another cell of its scene
+    has, because it failed there, is on no front, and displaces none. Its mean would leave out what was hard.
+
     Args:
         cells: from `means_by_cell`.
 
     Returns:
         `{sequence, setting, width, height, cost, figure, higher_is_better, front: [{method, profile,
-        budget, cost, value}]}`, the cheapest first.
+        budget, cost, value}], left_off: [{method, profile, budget}]}`, the cheapest first.
     """
     scenes: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
     for cell in cells:
         scenes.setdefault(tuple(cell[name] for name in SCENE), []).append(cell)
     found = []
     for scene, inside in scenes.items():
+        repetitions = {tuple(one) for cell in inside for one in cell["repetitions"]}
+        whole, lacking = (
+            [cell for cell in inside if (set(map(tuple, cell["repetitions"])) == repetitions) == complete]
+            for complete in (True, False)
+        )
         for cost in COSTS:
             for figure in figures():
-                named = _with_both(inside, cost, figure)
-                if not named:
+                named = _with_both(whole, cost, figure)
+                left_off = _with_both(lacking, cost, figure)
+                if not named and not left_off:
                     continue
                 points = [(float(cell[cost]), float(cell["figures"][figure.name])) for cell in named]
                 kept = front_of(points, higher_is_better=figure.higher_is_better)
@@ -108,6 +118,10 @@ def fronts(cells: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
                                 "value": points[index][1],
                             }
                             for index in kept
+                        ],
+                        "left_off": [
+                            {name: cell[name] for name in ("method", "profile", "budget")}
+                            for cell in left_off
                         ],
                     }
                 )

@@ -2,37 +2,78 @@
 
 Runs of both results that have everything in common, seed and repeat included, are pairs; a difference is
 judged by the spread of the pairs' differences (one-sided t test). Where seeds or repeats do not match, the
-two samples are compared as they are (Welch's test). Repeats of a seed count once for a figure. As very many
-quantities are looked at, the threshold is Holm's, over all of them: the chance of a single false alarm in a
-comparison is at most `LEVEL`. A difference smaller than what matters (`MATTERS`) is never a regression,
-however certain it is.
+two samples are compared as they are. Repeats of a seed count once for a figure.
+
+Two or three seeds say next to nothing about their own spread, so that no change that ever happens would be
+beyond noise by it. Spreads of a quantity are therefore pooled over all groups of the comparison, and taken
+`UNEQUAL` times as large, because noise differs from sequence to sequence. Elapsed and processor time have the
+noise of the machine as well (`SITTING`), which repeats of one sitting do not show.
+
+A method's costs and whole figures are also judged over all of its sequences: there every pair is one of a
+sample, seeds and sequences alike, which finds what is lost by little everywhere. That t test holds however
+unlike the noise of the sequences is (Ibragimov and Mueller 2010, "t-statistic based correlation and
+heterogeneity robust inference").
+
+As many quantities are looked at, the threshold is Holm's, in three families: costs and whole figures, of
+which a change counts for itself, on each sequence and over all, and figures of parts of the pixels, which say
+much the same again. The chance of a
+single false alarm in a comparison is at most `LEVEL` for normal noise whose deviation differs up to three
+times between groups. A difference smaller than what matters (`MATTERS`) is never a regression, however
+certain it is; where even `PLAUSIBLE` times as much could not have been told from noise, nothing is judged.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import fmean
 from typing import Any, Literal
 
 import numpy as np
 
 from extrags.errors import ConfigError
-from extrags.metrics.comparison import figure_of, spread
+from extrags.metrics.comparison import figure_of
 from extrags.metrics.registry import Figure, figures
 
-__all__ = ["COST_NAMES", "LEVEL", "MATTERS", "compare_results"]
+__all__ = [
+    "COST_NAMES",
+    "GROUP",
+    "LEVEL",
+    "MATTERS",
+    "SITTING",
+    "compare_results",
+    "grouped_runs",
+    "known_sizes",
+    "repetition",
+]
 
 LEVEL = 0.05
 """Chance of a false alarm in a whole comparison."""
+LEVELS = {"each": 0.02, "all": 0.02, "parts": 0.01}
+"""Shares of `LEVEL` by family: costs and whole figures on each sequence, over all sequences of a method, and
+figures of parts of the pixels."""
 COST_NAMES = ("seconds", "processor_seconds", "peak_mib")
 MATTERS = {"cost": 0.05, "dB": 0.1, "other": 0.01, "absolute": 0.01}
 """The smallest change that counts: share of a cost, decibels, share of any other figure; of what was 0, which
 has no shares, the change itself."""
+PLAUSIBLE = 10.0
+"""So many times what matters has to be found: a comparison that could not is not said to have found noise."""
+ENOUGH = 5
+"""From so many pairs on a row is judged by its own spread alone."""
+UNEQUAL = 2.0
+"""Pooled deviations are multiplied by this: a group has at most its square root of all groups' number, and of
+groups whose deviations differ three times the noisiest has up to twice the pooled one."""
+SITTING = 0.1
+"""Standard deviation of the logarithm of a machine's speed between two sittings: of one virtual machine it
+changed by a tenth within two hours (docs/algorithms/rasteriser.md)."""
+MANY = 1e9
+"""Degrees of freedom from which Student's t is the normal distribution."""
+TIMES = ("seconds", "processor_seconds")
 UNITS = {"cost": "share", "dB": "dB", "other": "share", "absolute": "absolute"}
 SIZE = ("width", "height")
 GROUP = ("method", "profile", "budget", "sequence", "setting", *SIZE)
+"""What runs have in common that differ in seed and repeat alone."""
 MACHINE = ("processor", "cores", "threads", "isa")
 
 Verdict = Literal["worse", "better", "noise", "equal", "not judged"]
@@ -47,25 +88,57 @@ class _Row:
     n: int
     before: float
     after: float
-    worsening: float
-    """In the unit of `kind`: positive is worse."""
-    low: float | None
-    high: float | None
-    p_worse: float | None
-    p_better: float | None
+    primary: bool
+    """Judged in the first family."""
+    logarithms: bool
+    """`change` is of logarithms."""
+    change: float
+    """Mean difference; positive is worse."""
+    variance: float | None
+    """Of single differences, or of the runs of a side; None where there is one."""
+    freedom: int
+    share: float
+    """The variance of `change` is so many times that of single differences."""
+    differences: tuple[float, ...] = ()
+    """Of the pairs, as `change`."""
+    low: float | None = None
+    high: float | None = None
+    p_worse: float | None = None
+    p_better: float | None = None
+    least: float = math.inf
+    """The smallest change that could have been told from noise, as `change`."""
     verdict: Verdict = "not judged"
+
+    @property
+    def family(self) -> str:
+        """Key of `LEVELS`."""
+        if not self.primary:
+            return "parts"
+        return "each" if self.about["sequence"] is not None else "all"
+
+    @property
+    def worsening(self) -> float:
+        """In the unit of `kind`: positive is worse."""
+        return self.in_unit(self.change)
+
+    def in_unit(self, change: float) -> float:
+        """A change of logarithms as a share."""
+        return math.expm1(change) if self.logarithms else change
 
     def to_json(self) -> dict[str, Any]:
         return {
             **self.about,
             "quantity": self.quantity,
+            "primary": self.primary,
             "unit": UNITS[self.kind],
             "paired": self.paired,
             "n": self.n,
             "before": self.before,
             "after": self.after,
             "worsening": self.worsening,
-            "interval": None if self.low is None else [self.low, self.high],
+            "interval": None
+            if self.low is None or self.high is None
+            else [self.in_unit(self.low), self.in_unit(self.high)],
             "verdict": self.verdict,
         }
 
@@ -78,23 +151,31 @@ def compare_results(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict
         after: of what is judged.
 
     Returns:
-        `{level, times_judged, protocols, rows, failed, missing, regressions}`. A row has what its runs
-        share, the quantity, means, the worsening (share of a cost or figure, or dB; `absolute`, in its own
-        unit, of what was 0; positive is worse), its 95 % interval and a verdict: `worse`, `better`, `noise`,
-        `equal`, or `not judged` where a single pair says nothing about noise. `failed` names groups of
+        `{level, times_judged, memory_judged, protocols, other_settings, rows, failed, missing, regressions,
+        not_judged}`. A row has what its
+        runs share (`sequence` is None over all sequences of a method), the quantity, whether it is a cost or
+        whole figure (`primary`), means, the worsening (share
+        of a cost or figure, or dB; `absolute`, in its own unit, of what was 0; positive is worse), its 95 %
+        interval and a verdict: `worse`, `better`, `noise`, `equal`, or `not judged` where seeds are too few
+        to tell a change of `PLAUSIBLE` times what matters from noise. `failed` names groups of
         runs that fail now and did not; `missing` those that are not in `after`, wholly or with a seed or
         repeat, and figures that no run there has any more. Times and memory are judged on one kind of
         machine only, figures by one version of the evaluation protocol: of another, the same renders may have
         other ones.
+        Memory is not judged either where runs of one result shared stages and those of the other did not
+        (`sharing`): who finds a stage made has not its peak. `other_settings` names groups whose runs were
+        asked for with other settings, though they are called alike, as variants may be: what they
+        differ in may be why.
         `protocols` has both versions, null for results that say none, whose figures are judged.
-        `regressions` has the rows that are worse, and what fails or is missing, in words.
+        `regressions` has the rows that are worse, and what fails or is missing, in words; `not_judged` the
+        primary rows that seem worse by more than matters and could not be judged.
 
     Raises:
         ConfigError: for a document that is no such result, or two that have no group in common.
     """
     found = [_cases(before, "the first result"), _cases(after, "the second result")]
-    sizes = [_sizes(cases) for cases in found]
-    sides = [_grouped(found[0], sizes), _grouped(found[1], sizes[::-1])]
+    sizes = [known_sizes(cases) for cases in found]
+    sides = [grouped_runs(found[0], sizes), grouped_runs(found[1], sizes[::-1])]
     common = [group for group in sides[0] if group in sides[1]]
     if not common:
         raise ConfigError("the two results have no method, budget, sequence and size of images in common")
@@ -102,29 +183,43 @@ def compare_results(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict
         (before.get("machine") or {}).get(key) == (after.get("machine") or {}).get(key) for key in MACHINE
     )
     protocols = [_protocol(document) for document in (before, after)]
+    sharing = [document.get("sharing") for document in (before, after)]
+    same_sharing = None in sharing or sharing[0] == sharing[1]
     one_protocol = None in protocols or protocols[0] == protocols[1]
     rows: list[_Row] = []
     failed = []
+    other_settings = []
     missing = [f"{_label(group)} was not run" for group in sides[0] if group not in sides[1]]
     for group in common:
         was, now = (side[group] for side in sides)
         if (error := _new_failure(was, now)) is not None:
             failed.append(f"{_label(group)} fails: {error}")
-        rows += _rows(group, was, now, costs=same, with_figures=one_protocol)
+        costs = [name for name in COST_NAMES if same and (same_sharing or name != "peak_mib")]
+        rows += _rows(group, was, now, costs=costs, with_figures=one_protocol)
+        if told := _other_settings(group, (was, before), (now, after)):
+            other_settings.append(told)
         if gone := _gone(was, now):
             missing.append(f"{_label(group)} was not run with {'; '.join(gone)}")
         if one_protocol:
             missing += [f"{_label(group)} has no {name}" for name in _lost(was, now)]
+    rows += _over_sequences(rows)
     _judge(rows)
     worse = [_words(row) for row in rows if row.verdict == "worse"]
     return {
         "level": LEVEL,
         "times_judged": same,
+        "memory_judged": same and same_sharing,
         "protocols": protocols,
+        "other_settings": other_settings,
         "rows": [row.to_json() for row in rows],
         "failed": failed,
         "missing": missing,
         "regressions": [*failed, *missing, *worse],
+        "not_judged": [
+            _words(row)
+            for row in rows
+            if row.primary and row.verdict == "not judged" and row.worsening >= MATTERS[row.kind]
+        ],
     }
 
 
@@ -142,8 +237,9 @@ def _cases(document: Mapping[str, Any], which: str) -> list[Mapping[str, Any]]:
             f"{which} is no JSON of `bench pipeline` or `benchmark`: its `cases` lack fields, or have others "
             "in their place"
         )
-    if not isinstance(document.get("machine") or {}, Mapping):
-        raise ConfigError(f"{which} is no JSON of `bench pipeline` or `benchmark`: `machine` is no object")
+    for name in ("machine", "methods"):
+        if not isinstance(document.get(name) or {}, Mapping):
+            raise ConfigError(f"{which} is no JSON of `bench pipeline` or `benchmark`: `{name}` is no object")
     return cases
 
 
@@ -170,7 +266,7 @@ def _is_case(case: Any, known: Sequence[str]) -> bool:
     )
 
 
-def _sizes(cases: Sequence[Mapping[str, Any]]) -> dict[tuple[Any, ...], set[tuple[Any, ...]]]:
+def known_sizes(cases: Sequence[Mapping[str, Any]]) -> dict[tuple[Any, ...], set[tuple[Any, ...]]]:
     """The sizes of images of all runs that have something in common but these."""
     found: dict[tuple[Any, ...], set[tuple[Any, ...]]] = {}
     for case in cases:
@@ -190,14 +286,17 @@ def _but_size(case: Mapping[str, Any]) -> tuple[Any, ...]:
     return tuple(case.get(key) for key in GROUP if key not in SIZE)
 
 
-def _grouped(
+def grouped_runs(
     cases: Sequence[Mapping[str, Any]], sizes: Sequence[Mapping[tuple[Any, ...], set[tuple[Any, ...]]]]
 ) -> dict[tuple[Any, ...], list[Mapping[str, Any]]]:
-    """Runs by what they have in common.
+    """Runs by what they have in common (`GROUP`).
+
+    A run that failed before the size of its frames was known counts as one of the size that the other runs
+    have, if it is one.
 
     Args:
         cases: of one result.
-        sizes: from `_sizes`, of the same result and of the other one.
+        sizes: from `known_sizes`, of the same result and of the other one.
     """
     found: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
     for case in cases:
@@ -211,19 +310,55 @@ def _grouped(
     return found
 
 
+def _other_settings(
+    group: tuple[Any, ...], *sides: tuple[Sequence[Mapping[str, Any]], Mapping[str, Any]]
+) -> str:
+    """What tells that the runs of a group were asked for with other settings, in words; empty for nothing.
+
+    Args:
+        group: what the runs have in common.
+        sides: its runs in each result, and the result.
+    """
+    asked = [{run.get("asked") for run in runs} for runs, _ in sides]
+    variants = [str((document.get("methods") or {}).get(group[0], "")) for _, document in sides]
+    given = [_given(runs) for runs, _ in sides]
+    if any(None in digests for digests in asked):
+        # Earlier results have words alone; those of a method may be worded anew, those of a variant say
+        # what it changes.
+        differs = (all(" = " in words for words in variants) and variants[0] != variants[1]) or (
+            all(given) and given[0] != given[1]
+        )
+    else:
+        differs = asked[0] != asked[1]
+    if not differs:
+        return ""
+    told = [f"{was or 'nothing'}, now {now or 'nothing'}" for was, now in (variants, given) if was != now]
+    return f"{_label(group)} was asked for with other settings{': ' if told else ''}{'; '.join(told)}"
+
+
+def _given(runs: Sequence[Mapping[str, Any]]) -> str:
+    """Settings that were given beside the profile, in words; empty where it is not known."""
+    found = {
+        ", ".join(f"{name} = {value}" for name, value in sorted(run["settings"].items()))
+        for run in runs
+        if isinstance(run.get("settings"), Mapping)
+    }
+    return " or ".join(sorted(found))
+
+
 def _new_failure(was: Sequence[Mapping[str, Any]], now: Sequence[Mapping[str, Any]]) -> str | None:
     """The error of a run that fails and did not; of one that was not run before, if none failed."""
-    before = {_repetition(run): bool(run["error"]) for run in was}
+    before = {repetition(run): bool(run["error"]) for run in was}
     unstable = any(before.values())
     for run in now:
-        if run["error"] and not before.get(_repetition(run), unstable):
+        if run["error"] and not before.get(repetition(run), unstable):
             return str(run["error"])
     return None
 
 
 def _gone(was: Sequence[Mapping[str, Any]], now: Sequence[Mapping[str, Any]]) -> list[str]:
     """Seeds and repeats that are not there any more, in words; none where all of them are other ones."""
-    before, after = ({_repetition(run) for run in runs} for runs in (was, now))
+    before, after = ({repetition(run) for run in runs} for runs in (was, now))
     if not before & after:
         return []
     repeated = any(repeat for _, repeat in before)
@@ -251,19 +386,17 @@ def _rows(
     was: Sequence[Mapping[str, Any]],
     now: Sequence[Mapping[str, Any]],
     *,
-    costs: bool,
+    costs: Sequence[str],
     with_figures: bool,
 ) -> list[_Row]:
     about = dict(zip(GROUP, group, strict=True))
-    wanted: list[tuple[str, str, Figure | None]] = []
-    if costs:
-        wanted += [(name, "cost", None) for name in COST_NAMES]
+    wanted: list[tuple[str, str, Figure | None]] = [(name, "cost", None) for name in costs]
     if with_figures:
         wanted += [(figure.name, "dB" if figure.unit == "dB" else "other", figure) for figure in figures()]
     found = []
     for name, kind, figure in wanted:
         sides = [_values(runs, name, figure) for runs in (was, now)]
-        if not all(sides):
+        if not all(sides) or _says_it_again(figure, sides, was, now):
             continue
         shared = [key for key in sides[0] if key in sides[1]]
         paired = len(shared) == max(len(sides[0]), len(sides[1])) or len(shared) > 1
@@ -281,12 +414,36 @@ def _values(runs: Sequence[Mapping[str, Any]], name: str, figure: Figure | None)
     for run in runs:
         value = run.get(name) if figure is None else figure_of(run["metrics"], figure.name)
         if not run["error"] and value is not None and math.isfinite(value):
-            key = _repetition(run) if figure is None else run["seed"]
+            key = repetition(run) if figure is None else run["seed"]
             found.setdefault(key, []).append(float(value))
     return {key: fmean(values) for key, values in found.items()}
 
 
-def _repetition(run: Mapping[str, Any]) -> tuple[Any, ...]:
+def _says_it_again(
+    figure: Figure | None,
+    sides: Sequence[Mapping[Any, float]],
+    was: Sequence[Mapping[str, Any]],
+    now: Sequence[Mapping[str, Any]],
+) -> bool:
+    """Whether it is of all pixels where the mask is full: the overall figure under another name."""
+    if figure is None or figure.name != f"whole.{figure.key}":
+        return False
+    return list(sides) == [_values(runs, figure.key, replace(figure, name=figure.key)) for runs in (was, now)]
+
+
+def _is_primary(figure: Figure | None) -> bool:
+    """Costs, and the figures of all valid pixels and of the surface that tables show.
+
+    Others are of parts of these pixels, with one gain per view, or other measures of the same errors.
+    """
+    return figure is None or (
+        figure.name in {shown.name for shown in figures("differences") if "." not in shown.name}
+        or figure.name in {shown.name for shown in figures("counts")}
+    )
+
+
+def repetition(run: Mapping[str, Any]) -> tuple[Any, ...]:
+    """Seed and repeat of a run."""
     return run["seed"], run.get("repeat", 0)
 
 
@@ -298,8 +455,6 @@ def _row(
     paired: bool,
     samples: Sequence[Sequence[float]],
 ) -> _Row:
-    from scipy.stats import t
-
     sign = -1.0 if figure is not None and figure.higher_is_better else 1.0
     before, after = (np.asarray(sample, dtype=np.float64) for sample in samples)
     # Costs are multiplied by what slows a machine: they are compared as shares, by their logarithms.
@@ -311,33 +466,10 @@ def _row(
     else:
         scale = 1.0 if kind in ("dB", "absolute") else abs(float(before.mean()))
         x, y = before / scale, after / scale
-    low = high = worse = better = None
-    if paired:
-        difference = sign * (y - x)
-        of = spread(list(difference))
-        mean, n = of.mean, of.n
-        if of.deviation is not None:
-            low, high = of.low, of.high
-            error = of.deviation / math.sqrt(n)
-            freedom = float(n - 1)
-    else:
-        n = min(len(x), len(y))
-        mean = sign * float(y.mean() - x.mean())
-        if n > 1:
-            parts = [float(sample.var(ddof=1)) / len(sample) for sample in (x, y)]
-            error = math.sqrt(sum(parts))
-            below = sum(part**2 / (len(sample) - 1) for part, sample in zip(parts, (x, y), strict=True))
-            freedom = error**4 / below if below > 0 else float(n - 1)
-            reach = float(t.ppf(0.975, freedom)) * error
-            low, high = mean - reach, mean + reach
-    if low is not None:
-        # What is the same in every pair is certain, with whatever sign.
-        statistic = mean / error if error > 0 else math.copysign(math.inf, mean) if mean else 0.0
-        worse, better = float(t.sf(statistic, freedom)), float(t.cdf(statistic, freedom))
-
-    def share(value: float | None) -> float | None:
-        return None if value is None else math.expm1(value) if logarithms else value
-
+    parts = [sign * (y - x)] if paired else [x, y]
+    freedom = sum(len(part) - 1 for part in parts)
+    squares = sum(float(((part - part.mean()) ** 2).sum()) for part in parts)
+    n = min(map(len, parts))
     return _Row(
         about,
         name,
@@ -346,31 +478,111 @@ def _row(
         n,
         float(before.mean()),
         float(after.mean()),
-        share(mean) or 0.0,
-        share(low),
-        share(high),
-        worse,
-        better,
+        _is_primary(figure),
+        logarithms,
+        float(parts[0].mean()) if paired else sign * float(y.mean() - x.mean()),
+        squares / freedom if n > 1 else None,
+        freedom,
+        sum(1 / len(part) for part in parts),
+        tuple(parts[0].tolist()) if paired else (),
     )
 
 
-def _judge(rows: Sequence[_Row]) -> None:
-    """Holm's procedure in each direction, then what matters."""
+def _over_sequences(rows: Sequence[_Row]) -> list[_Row]:
+    """Costs and whole figures of each method, profile and budget over all its sequences."""
+    samples: dict[tuple[Any, ...], list[_Row]] = {}
     for row in rows:
-        if row.p_worse is not None:
-            row.verdict = "noise"
-        if row.worsening == 0.0 and row.before == row.after and (row.low in (None, 0.0)):
+        if row.primary and row.paired:
+            what = (*(row.about[key] for key in ("method", "profile", "budget")), row.quantity, row.kind)
+            samples.setdefault((*what, row.logarithms), []).append(row)
+    found = []
+    for inside in samples.values():
+        if len(inside) < 2:
+            continue
+        pairs = np.concatenate([row.differences for row in inside])
+        found.append(
+            replace(
+                inside[0],
+                about={**inside[0].about, **dict.fromkeys(("sequence", "setting", *SIZE))},
+                n=len(pairs),
+                before=fmean(row.before for row in inside),
+                after=fmean(row.after for row in inside),
+                change=float(pairs.mean()),
+                variance=float(pairs.var(ddof=1)),
+                freedom=len(pairs) - 1,
+                share=1 / len(pairs),
+            )
+        )
+    return found
+
+
+def _judge(rows: Sequence[_Row]) -> None:
+    """Noise of each row, Holm's procedure in each family and direction, then what matters."""
+    for row in rows:
+        if row.worsening == 0.0 and row.before == row.after and not row.variance:
             row.verdict = "equal"
-    # Over all that could be judged: to look only at what has changed by enough would be to look at the data
-    # first, and to be content with fewer quantities than were looked at.
-    tested = [row for row in rows if row.p_worse is not None]
+    tested = [row for row in rows if row.variance is not None]
+    pools: dict[tuple[Any, ...], list[_Row]] = {}
+    for row in tested:
+        pool = (row.family, row.quantity, row.kind, row.paired, row.logarithms)
+        pools.setdefault(pool, []).append(row)
+    for alike in pools.values():
+        # Over all that could be judged: to look only at what has changed by enough would be to look at the
+        # data first, and to be content with fewer quantities than were looked at.
+        family = alike[0].family
+        level = LEVELS[family] / sum(row.family == family for row in tested)
+        for row in alike:
+            _measure(row, alike, level)
+    for family, level in LEVELS.items():
+        _holm([row for row in tested if row.family == family], level)
+
+
+def _measure(row: _Row, alike: Sequence[_Row], level: float) -> None:
+    """Probabilities of the change of a row by chance, its interval, and what could have been found.
+
+    Args:
+        row: with at least two pairs, or runs a side; filled in.
+        alike: rows of its quantity that can be judged, itself among them: their noise is pooled.
+        level: of its family, divided by the number of rows there.
+    """
+    from scipy.special import stdtr, stdtrit
+
+    own = row.variance or 0.0
+    if row.n >= ENOUGH or len(alike) == 1 or row.family == "all":
+        variance, freedom = own, float(row.freedom)
+    else:
+        freedom = float(sum(other.freedom for other in alike))
+        pooled = sum((other.variance or 0.0) * other.freedom for other in alike) / freedom
+        variance = max(own, pooled * min(UNEQUAL**2, len(alike)))
+    square = variance * row.share
+    if row.quantity in TIMES:
+        # Of known size, so that it adds degrees of freedom (Satterthwaite).
+        whole = square + SITTING**2
+        freedom *= (whole / square) ** 2 if square > 0 else math.inf
+        square = whole
+    error, freedom = math.sqrt(square), min(freedom, MANY)
+    reach = float(stdtrit(freedom, 0.975)) * error
+    row.low, row.high = row.change - reach, row.change + reach
+    row.least = -float(stdtrit(freedom, level)) * error
+    # What is the same in every pair is certain, with whatever sign.
+    statistic = (
+        row.change / error if error > 0 else math.copysign(math.inf, row.change) if row.change else 0.0
+    )
+    row.p_worse, row.p_better = float(stdtr(freedom, -statistic)), float(stdtr(freedom, statistic))
+
+
+def _holm(tested: Sequence[_Row], level: float) -> None:
+    """Holm's procedure in each direction; what it leaves is noise where a plausible change would be found."""
+    for row in tested:
+        if row.verdict != "equal" and row.in_unit(row.least) <= PLAUSIBLE * MATTERS[row.kind]:
+            row.verdict = "noise"
     directions: tuple[tuple[str, Verdict, float], ...] = (
         ("p_worse", "worse", 1.0),
         ("p_better", "better", -1.0),
     )
     for attribute, verdict, sign in directions:
         for rank, row in enumerate(sorted(tested, key=lambda row: float(getattr(row, attribute)))):
-            if getattr(row, attribute) > LEVEL / (len(tested) - rank):
+            if getattr(row, attribute) > level / (len(tested) - rank):
                 break
             if sign * row.worsening >= MATTERS[row.kind]:
                 row.verdict = verdict
@@ -382,7 +594,7 @@ def _words(row: _Row) -> str:
 
     interval = ""
     if row.low is not None and row.high is not None:
-        interval = f" [{amount(row.low)} to {amount(row.high)}]"
+        interval = f" [{amount(row.in_unit(row.low))} to {amount(row.in_unit(row.high))}]"
     return (
         f"{_label(tuple(row.about.values()))}: {row.quantity} {row.before:.4g} to {row.after:.4g}, worse by "
         f"{amount(row.worsening)}{interval}, {row.n} {'pairs' if row.paired else 'runs a side'}"
@@ -394,5 +606,5 @@ def _label(group: tuple[Any, ...]) -> str:
     size = f", {width}x{height}" if width else ""
     return (
         f"{method} ({profile}{f', {budget}' if budget and budget != 'profile' else ''}) on "
-        f"{sequence}{f'@{setting}' if setting else ''}{size}"
+        f"{sequence or 'all sequences'}{f'@{setting}' if setting else ''}{size}"
     )

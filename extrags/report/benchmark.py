@@ -201,8 +201,10 @@ def _difference_cell(found: Mapping[str, Any], column: Figure) -> dict[str, str]
     figure = found[column.name]
     if note := _apart(found, column):
         return {**NO_CELL, "value": number(figure["mean"], column.digits, signed=True), "note": note}
-    if round(figure["mean"], column.digits) == 0:
+    if all(round(figure[end], column.digits) == 0 for end in ("smallest", "largest")):
         verdict = "equal"
+    elif not _beyond_noise(figure):
+        verdict = ""
     else:
         verdict = "better" if (figure["mean"] > 0) == column.higher_is_better else "worse"
     return {
@@ -211,6 +213,11 @@ def _difference_cell(found: Mapping[str, Any], column: Figure) -> dict[str, str]
         "note": _interval(figure, column.digits),
         "better": f"better in {figure['better']} of {figure['n']}",
     }
+
+
+def _beyond_noise(figure: Mapping[str, Any]) -> bool:
+    """Whether the interval of a difference leaves out 0; never of a single pair, which has none."""
+    return figure["low"] is not None and (figure["low"] > 0 or figure["high"] < 0)
 
 
 def _apart(found: Mapping[str, Any], column: Figure) -> str:
@@ -268,7 +275,9 @@ def _difference_chart(
         given = [row["figures"].get(panel.name) for panel in panels]
         cells = [None if found is None else (found["mean"], found["low"], found["high"]) for found in given]
         unjudged |= {
-            (len(lines), place) for place, panel in enumerate(panels) if _apart(row["figures"], panel)
+            (len(lines), place)
+            for place, (panel, found) in enumerate(zip(panels, given, strict=True))
+            if found is not None and (_apart(row["figures"], panel) or not _beyond_noise(found))
         }
         lines.append((f"{row['method']}, {line_of(row)}" if several else line_of(row), cells))
     titles = [

@@ -386,7 +386,7 @@ def pairs_chart(
         panels: title of each figure, and whether more is better.
         rows: name of each line, from the top, and by panel mean, low and high; None where there is no
             difference, no interval for a single pair.
-        unjudged: row and panel of differences of which neither sign is the better one.
+        unjudged: row and panel of differences that are not called better or worse.
     """
     from matplotlib.ticker import MaxNLocator
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean, stdev
 from typing import Any, Literal
@@ -71,8 +71,8 @@ def build_leaderboard(rows: Sequence[BoardRow], *, name: str = "Leaderboard") ->
     """One self-contained HTML page: a table of sequences by methods for each figure, and all runs.
 
     Cells of the first are means over seeds; its last row is the mean over those sequences that every method
-    has, so that no method gains by what it was not run on. Scripts sort and filter; without them all tables
-    are there.
+    has, so that no method gains by what it was not run on. The best of a row is marked where all its methods
+    have the same seeds. Scripts sort and filter; without them all tables are there.
 
     Args:
         rows: the runs, failed ones among them.
@@ -147,6 +147,11 @@ def _warnings(rows: Sequence[BoardRow]) -> list[str]:
             "cannot be compared. Runs of the older ones, started again, are measured anew without being made "
             "anew."
         )
+    if unlike := _unlike_seeds(rows):
+        found.append(
+            f"Not all methods have figures of the same seeds on {', '.join(unlike)}: none is marked as best "
+            "there, and means over these sequences have no best either."
+        )
     if len({row.further for row in rows}) > 1:
         found.append(
             "Not all runs had the same further settings: they stand with each in the list of all runs, and "
@@ -155,27 +160,58 @@ def _warnings(rows: Sequence[BoardRow]) -> list[str]:
     return found
 
 
+def _unlike_seeds(rows: Sequence[BoardRow]) -> list[str]:
+    """Sequences, with the profile, on which methods that may be the best have other seeds than each other."""
+    seeds: dict[tuple[str, str], dict[str, set[str]]] = {}
+    ceilings = _ceilings(rows)
+    for row in rows:
+        if row.metrics is not None and row.status == "ok" and row.column not in ceilings:
+            by_method = seeds.setdefault((row.sequence, row.profile), {})
+            by_method.setdefault(row.column, set()).add(row.seed)
+    return sorted(
+        f"{sequence} ({profile})"
+        for (sequence, profile), by_method in seeds.items()
+        if not _all_equal(by_method.values())
+    )
+
+
+def _all_equal(sets: Iterable[set[str]]) -> bool:
+    return len({frozenset(one) for one in sets}) <= 1
+
+
+def _ceilings(rows: Sequence[BoardRow]) -> set[str]:
+    """Methods whose scenes have seen the held-out frames, or may have."""
+    return {row.column for row in rows if row.held_out_trained_on or row.imported}
+
+
 def _board(rows: Sequence[BoardRow], figure: Figure, profile: str) -> dict[str, Any] | None:
     """A figure of one profile, sequences by methods; None where no run has it."""
     values: dict[tuple[str, str], list[float]] = {}
     shares: dict[tuple[str, str], list[float]] = {}
+    seeds: dict[tuple[str, str], set[str]] = {}
     for row in rows:
         value = None if row.metrics is None or row.profile != profile else figure_of(row.metrics, figure.name)
         if value is not None and row.status == "ok":
             values.setdefault((row.sequence, row.column), []).append(value)
+            seeds.setdefault((row.sequence, row.column), set()).add(row.seed)
             share = figure_of(row.metrics, figure.coverage) if figure.coverage else None
             if share is not None:
                 shares.setdefault((row.sequence, row.column), []).append(share)
     if not values:
         return None
     methods = _distinct(method for _, method in values)
-    ceilings = {row.column for row in rows if row.held_out_trained_on or row.imported}
+    ceilings = _ceilings(rows)
     rivals = [method for method in methods if method not in ceilings]
     sequences = _distinct(sequence for sequence, _ in values)
     datasets = {row.sequence: row.dataset for row in rows}
     means, covered = (
         {place: fmean(found) for place, found in by_place.items()} for by_place in (values, shares)
     )
+    # A mean over the seeds that one method lacks, because it failed there, is of other runs.
+    alike = {
+        item: _all_equal(seeds[item, method] for method in rivals if (item, method) in seeds)
+        for item in sequences
+    }
     complete = [item for item in sequences if all((item, method) in means for method in methods)]
     lines = []
     for sequence in sequences:
@@ -191,7 +227,13 @@ def _board(rows: Sequence[BoardRow], figure: Figure, profile: str) -> dict[str, 
                 "cells": [
                     {**cell, "note": note}
                     for cell, note in zip(
-                        _cells(cells, figure, ceilings, [covered.get((sequence, name)) for name in rivals]),
+                        _cells(
+                            cells,
+                            figure,
+                            ceilings,
+                            [covered.get((sequence, name)) for name in rivals],
+                            same_seeds=alike[sequence],
+                        ),
                         deviations,
                         strict=True,
                     )
@@ -210,7 +252,13 @@ def _board(rows: Sequence[BoardRow], figure: Figure, profile: str) -> dict[str, 
         "methods": methods,
         "lines": lines,
         "complete": len(complete),
-        "means": _cells({method: overall.get(method) for method in methods}, figure, ceilings, apart)
+        "means": _cells(
+            {method: overall.get(method) for method in methods},
+            figure,
+            ceilings,
+            apart,
+            same_seeds=all(alike[item] for item in complete),
+        )
         if overall
         else [],
     }
@@ -221,13 +269,20 @@ def _cells(
     figure: Figure,
     ceilings: Collection[str],
     shares: Sequence[float | None],
+    *,
+    same_seeds: bool,
 ) -> list[dict[str, Any]]:
-    """Figures of a row by method; the best marked where there are several over the same `shares` of pixels.
+    """Figures of a row by method; the best marked where there are several over the same pixels and seeds.
 
-    `ceilings` are methods whose scenes have seen the held-out frames: they are no competitors.
+    Args:
+        values: by method.
+        figure: what they are.
+        ceilings: methods whose scenes have seen the held-out frames: they are no competitors.
+        shares: of the pixels that the figures of the others are over, in [0, 1].
+        same_seeds: whether the others have the same ones.
     """
     known = [value for method, value in values.items() if value is not None and method not in ceilings]
-    comparable = len(known) > 1 and same_pixels(*shares)
+    comparable = len(known) > 1 and same_seeds and same_pixels(*shares)
     best = (max(known) if figure.higher_is_better else min(known)) if comparable else None
     return [
         {

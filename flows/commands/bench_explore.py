@@ -7,6 +7,7 @@ import os
 from typing import Any
 
 from extrags.errors import ConfigError
+from flows.commands.benchmark import parsed_seeds
 from flows.commands.common import items, set_up_logging, store_root, write_json
 from flows.commands.options import Parser, add_json, add_profile, add_sequences, add_settings, add_store
 from flows.interruption import RESUMABLE, say_when_interrupted
@@ -72,7 +73,9 @@ def explore(given: argparse.Namespace) -> int:
 
     root = store_root(given)
     views = _numbers("--views", given.views)
-    seeds = _numbers("--seeds", given.seeds)
+    if not views:
+        raise ConfigError(f"--views {' '.join(given.views)}: expected one or more whole numbers")
+    seeds = parsed_seeds(given.seeds)
     end_use = [] if given.end_use is None else _numbers("--end-use", given.end_use) or [max(views)]
     prepare(Store(root).state, debug=given.debug)
     from flows.exploration_ways import WAYS, bench_explore, check_ways

@@ -177,6 +177,10 @@ def grid_markdown(found: dict[str, Any]) -> str:
     if not found["separate"]:
         # Stages do not give back all that they took.
         lines += ["", "*: depends on which run made what runs share; comparable with --separate alone."]
+    if any(entry["left_off"] for entry in found["fronts"]):
+        lines += [
+            "What failed with a seed or repeat that others have is on no front: its means are of fewer runs."
+        ]
     failed = [case for case in found["cases"] if case["error"]]
     lines += [""] * bool(failed)
     for case in failed:

@@ -80,7 +80,8 @@ def add_arguments(parser: Parser) -> None:
         "--max-slowdown",
         type=float,
         metavar="SHARE",
-        help="with --refresh: exit code 1 when run time is longer than the median of the last runs by more",
+        help="with --refresh: exit code 1 when run time is longer than the median of the last runs by more, "
+        "and by more than 5 s",
     )
     add_settings(parser)
     add_store(parser)

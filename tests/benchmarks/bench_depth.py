@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.stats import spearmanr
 
 from data_catalog import read
 from extrags.config import DepthConfig, PosesConfig
@@ -46,9 +47,8 @@ def measured(found: np.ndarray, truth: np.ndarray, known: np.ndarray, *, rescale
 
 
 def rank_correlation(error: np.ndarray, expected: np.ndarray) -> float:
-    """Spearman's."""
-    ranks = [values.argsort().argsort().astype(np.float64) for values in (error, expected)]
-    return float(np.corrcoef(ranks[0], ranks[1])[0, 1])
+    """Spearman's; equal values have the mean of their ranks, not one by their place in the image."""
+    return float(spearmanr(error, expected).statistic)
 
 
 def cues(sequence: EndoscopicSequence, *, estimate_the_poses: bool) -> dict[str, Any]:

@@ -79,6 +79,9 @@ def test_end_use_restores_and_fine_tunes(store: Path, capsys: pytest.CaptureFixt
         ([SEQUENCE, "--ways", "oracle"], "unknown ways oracle; expected extrags, paper"),
         ([SEQUENCE, "--views", "0"], "numbers of views [0]; expected 1 or more"),
         ([SEQUENCE, "--views", "many"], "--views many: expected a whole number"),
+        ([SEQUENCE, "--views", ",", "--end-use"], "--views ,: expected one or more whole numbers"),
+        ([SEQUENCE, "--seeds", ","], "expected one or more different seeds"),
+        ([SEQUENCE, "--seeds", "1", "1"], "--seeds 1,1: expected one or more different seeds"),
     ],
 )
 def test_wrong_usage_is_one_sentence(

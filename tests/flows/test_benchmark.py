@@ -16,7 +16,7 @@ from extrags.config import profile_config
 from extrags.errors import ArtefactGoneError, ConfigError
 from extrags.metrics.registry import PROTOCOL_VERSION
 from extrags.store import Store
-from flows.benchmark import Case, benchmark, check_methods, run_method, summary_of
+from flows.benchmark import Case, benchmark, case_of, check_methods, run_method, summary_of
 from flows.commands.benchmark import print_benchmark
 from flows.history import Tolerance, history_of
 from flows.limits import StageLimits
@@ -281,7 +281,7 @@ def test_what_was_asked_for_is_told_from_all_settings(monkeypatch: pytest.Monkey
         "flows.settings.profile_config",
         lambda name: profile_config(name).with_overrides({"coarse.iterations": 7}),
     )
-    assert case().asked == plain.asked
+    assert case().asked == plain.asked == case_of(plain)["asked"]
     assert case().settings != plain.settings
 
 

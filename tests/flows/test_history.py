@@ -11,6 +11,7 @@ import pytest
 from pydantic import ValidationError
 
 from extrags.errors import ConfigError
+from extrags.metrics.registry import PROTOCOL_VERSION
 from extrags.report.benchmark import BenchmarkInputs, build_benchmark_report
 from extrags.store import Store
 from flows.benchmark import benchmark
@@ -224,6 +225,16 @@ class TestRecords:
         ]
         assert trend([]) == []
 
+    def test_the_trend_joins_no_figures_of_another_version_of_the_protocol(self) -> None:
+        older = {**entry(psnr=25, day=1), "protocol": PROTOCOL_VERSION - 1}
+        # Of entries from before it was on record nobody knows the version: they are drawn, as judged.
+        silent = {key: value for key, value in entry(psnr=19, day=2).items() if key != "protocol"}
+        assert [item["methods"]["coarse"] for item in trend([older, silent, entry(psnr=20, day=3)])] == [
+            {"psnr": None, "seconds": 100.5},
+            {"psnr": 21.0, "seconds": 100.5},
+            {"psnr": 22.0, "seconds": 100.5},
+        ]
+
     def test_the_trend_is_over_the_seeds_of_the_last_run(self) -> None:
         entries = [entry(day=1, seeds=(0, 1, 2)), entry(day=2, seeds=(0,)), entry(day=3, seeds=(2,))]
         assert [item["methods"].get("coarse") for item in trend(entries)] == [
@@ -359,6 +370,15 @@ class TestFlow:
         assert main([*arguments, "--json", str(out), "--store", str(tmp_path / "store")]) == 1
         assert json.loads(out.read_text()) == found
         assert "worse: coarse on phantom/0@sparse: 20 s" in capsys.readouterr().out
+
+    def test_the_help_says_what_slowdown_is_never_too_much(self, capsys: pytest.CaptureFixture[str]) -> None:
+        with pytest.raises(SystemExit):
+            main(["benchmark", "--help"])
+        said = " ".join(capsys.readouterr().out.split())
+        assert (
+            f"longer than the median of the last runs by more, and by more than {Tolerance().seconds:g} s"
+            in said
+        )
 
     def test_a_tolerance_needs_a_measurement(self, tmp_path: Path) -> None:
         with pytest.raises(ConfigError, match="needs refresh"):

@@ -73,5 +73,27 @@ class TestCells:
         assert found[160, "seconds"] == ["a"]
         assert found[80, "seconds"] == ["b"]
 
+    def test_what_failed_on_a_hard_seed_displaces_nothing(self) -> None:
+        runs = [
+            case("a", 10, 30),
+            case("a", 10, 20, seed=1),
+            case("b", 9.9, 29.9),
+            case("b", 1, None, seed=1),
+        ]
+        found = fronts(means_by_cell(runs))
+        assert {entry["cost"] for entry in found} == {"seconds", "processor_seconds", "peak_mib"}
+        for entry in found:
+            assert [point["method"] for point in entry["front"]] == ["a"]
+            assert [cell["method"] for cell in entry["left_off"]] == ["b"]
+
+    def test_a_seed_that_failed_everywhere_counts_for_none(self) -> None:
+        runs = [case(method, 10, 20) for method in "ab"] + [case(method, 1, None, seed=1) for method in "ab"]
+        assert not any(entry["left_off"] for entry in fronts(means_by_cell(runs)))
+
+    def test_what_failed_before_its_size_was_known_is_of_the_same_cell(self) -> None:
+        unread = {**case("a", 1, None, seed=1), "width": None, "height": None}
+        (cell,) = means_by_cell([case("a", 10, 30), unread])
+        assert (cell["width"], cell["runs"], cell["failed"]) == (160, 1, 1)
+
     def test_what_has_no_figure_is_on_no_front(self) -> None:
         assert fronts(means_by_cell([case("a", 1, None)])) == []

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from extrags.errors import ConfigError
+from extrags.metrics.registry import figures
 from extrags.metrics.regression import compare_results
 
 MACHINE = {"processor": "one", "cores": 2, "threads": 1, "isa": "avx2"}
@@ -118,6 +119,214 @@ def test_few_false_alarms_among_many_quantities(seeds: int) -> None:
     )
     # Of 200 there were 3, 3 and 6; corrected over what has changed by enough alone 14, 13 and 21.
     assert alarms <= 6
+
+
+def whole_result(
+    *,
+    seeds: int,
+    entropy: int,
+    worse_db: float = 0.0,
+    slower: float = 1.0,
+    sequences: int = 3,
+    deviations: tuple[float, ...] = (0.1,),
+    pace: float = 1.0,
+) -> dict[str, Any]:
+    """Two methods on some sequences with all costs and figures, of which the second method is worse.
+
+    Args:
+        seeds: of each.
+        entropy: of the noise.
+        worse_db: PSNR of all pixels that the second method has lost everywhere.
+        slower: how many times as long the second method takes.
+        sequences: their number.
+        deviations: of PSNR between seeds, sequence by sequence, in dB; of other figures a hundredth.
+        pace: how many times as long everything takes on this machine today.
+    """
+    rng = np.random.default_rng(entropy)
+
+    def metrics(deviation_db: float, loss_db: float) -> dict[str, Any]:
+        tree: dict[str, Any] = {}
+        for figure in figures():
+            node = tree
+            *group, key = figure.name.split(".")
+            for part in group:
+                node = node.setdefault(part, {})
+            base, noise = (27.0, deviation_db) if figure.unit == "dB" else (0.5, deviation_db / 100)
+            node[key] = base + noise * float(rng.normal()) - loss_db * (figure.name == "psnr")
+        return tree
+
+    cases = [
+        {
+            "method": method,
+            "profile": "quick",
+            "sequence": f"phantom/{number}",
+            "setting": "sparse",
+            "seed": seed,
+            "seconds": 60 * factor * pace * float(np.exp(0.02 * rng.normal())),
+            "processor_seconds": 60 * factor * pace * float(np.exp(0.01 * rng.normal())),
+            "peak_mib": 800 * float(np.exp(0.005 * rng.normal())),
+            "image_size": [160, 128],
+            "metrics": metrics(deviations[number % len(deviations)], loss_db),
+            "error": "",
+        }
+        for method, loss_db, factor in (("coarse", 0.0, 1.0), ("extrags", worse_db, slower))
+        for number in range(sequences)
+        for seed in range(seeds)
+    ]
+    return {"machine": MACHINE, "cases": cases}
+
+
+class TestPowerAtRealSize:
+    @pytest.mark.parametrize(("seeds", "worse_db"), [(3, 1.0), (2, 5.0)])
+    def test_a_gross_loss_is_found_on_every_sequence(self, seeds: int, worse_db: float) -> None:
+        found = []
+        alarms = 0
+        for number in range(10):
+            before = whole_result(seeds=seeds, entropy=2 * number)
+            after = whole_result(seeds=seeds, entropy=2 * number + 1, worse_db=worse_db)
+            rows = compare_results(before, after)["rows"]
+            assert len(rows) > 200
+            worse = [row for row in rows if row["verdict"] == "worse"]
+            lost = [row for row in worse if (row["method"], row["quantity"]) == ("extrags", "psnr")]
+            assert None in {row["sequence"] for row in lost}
+            found.append(sum(row["sequence"] is not None for row in lost))
+            alarms += len(lost) < len(worse)
+        assert sum(found) >= 28
+        assert alarms <= 1
+
+    def test_times_three_times_as_long_are_found(self) -> None:
+        found = compare_results(
+            whole_result(seeds=2, entropy=0), whole_result(seeds=2, entropy=1, slower=3.0)
+        )
+        worse = [row["quantity"] for row in found["rows"] if row["verdict"] == "worse"]
+        assert sorted(worse) == ["processor_seconds"] * 4 + ["seconds"] * 4
+
+    def test_a_small_loss_everywhere_is_found_over_all_sequences(self) -> None:
+        lines = [
+            line
+            for number in range(5)
+            for line in compare_results(
+                whole_result(seeds=3, entropy=2 * number),
+                whole_result(seeds=3, entropy=2 * number + 1, worse_db=0.4),
+            )["regressions"]
+        ]
+        assert sum(line.startswith("extrags (quick) on all sequences: psnr") for line in lines) >= 4
+        assert all("psnr" in line for line in lines)
+
+    def test_several_sequences_need_no_second_seed(self) -> None:
+        found = compare_results(
+            whole_result(seeds=1, entropy=0), whole_result(seeds=1, entropy=1, worse_db=5.0)
+        )
+        (line,) = found["regressions"]
+        assert line.startswith("extrags (quick) on all sequences: psnr")
+
+    def test_a_loss_on_one_of_the_sequences(self) -> None:
+        before, after = (whole_result(seeds=2, entropy=entropy) for entropy in (0, 1))
+        for case in after["cases"]:
+            if (case["method"], case["sequence"]) == ("coarse", "phantom/1"):
+                case["metrics"]["psnr"] -= 5
+        (line,) = compare_results(before, after)["regressions"]
+        assert line.startswith("coarse (quick) on phantom/1@sparse, 160x128: psnr")
+
+    @pytest.mark.parametrize("seeds", [2, pytest.param(3, marks=pytest.mark.slow)])
+    @pytest.mark.parametrize("deviations", [(0.1,), (0.3, 0.1, 0.1)])
+    def test_few_false_alarms(self, seeds: int, deviations: tuple[float, ...]) -> None:
+        """Also where one sequence is three times as noisy as the others, which pooling does not know."""
+        alarms = sum(
+            bool(
+                compare_results(
+                    whole_result(seeds=seeds, entropy=2 * number, deviations=deviations),
+                    whole_result(seeds=seeds, entropy=2 * number + 1, deviations=deviations),
+                )["regressions"]
+            )
+            for number in range(12)
+        )
+        # Of 300 with 2 and 3 seeds: 0 and 2, 4 and 2 with a noisy sequence.
+        assert alarms <= 2
+
+    def test_the_pace_of_the_machine_is_no_regression(self) -> None:
+        """Repeats of a sitting share it; 10 % between two sittings were measured."""
+        paces = np.exp(0.07 * np.random.default_rng(0).normal(size=(10, 2)))
+        alarms = sum(
+            bool(
+                compare_results(
+                    whole_result(seeds=5, entropy=2 * number, pace=float(before)),
+                    whole_result(seeds=5, entropy=2 * number + 1, pace=float(after)),
+                )["regressions"]
+            )
+            for number, (before, after) in enumerate(paces)
+        )
+        assert alarms <= 2
+
+    def test_what_could_not_be_judged_is_told(self) -> None:
+        found = compare_results(
+            whole_result(seeds=1, entropy=0, sequences=1),
+            whole_result(seeds=1, entropy=1, sequences=1, worse_db=5.0),
+        )
+        assert {row["verdict"] for row in found["rows"]} == {"not judged"}
+        assert found["regressions"] == []
+        told = [line.split(" on ")[0] for line in found["not_judged"] if ": psnr 2" in line]
+        assert "extrags (quick)" in told
+        # A pair of seeds of one sequence alone is too little to tell a loss of decibels from noise.
+        before, after = (result(seeds=range(2)) for _ in range(2))
+        for case, loss_db in zip(after["cases"], (0.3, 1.8), strict=True):
+            case["metrics"]["psnr"] -= loss_db
+        alone = compare_results(before, after)
+        assert verdicts(alone)["psnr"] == "not judged"
+        (line,) = alone["not_judged"]
+        assert "worse by 1.05 dB" in line
+
+    def test_figures_of_parts_are_a_family_of_their_own(self) -> None:
+        rows = compare_results(whole_result(seeds=2, entropy=0), whole_result(seeds=2, entropy=1))["rows"]
+        primary = {row["quantity"] for row in rows if row["primary"]}
+        assert {"seconds", "peak_mib", "psnr", "ssim", "lpips_alex", "depth_absrel"} <= primary
+        assert not {"observed.psnr", "aligned.psnr", "whole.psnr", "flip", "depth_rmse"} & primary
+
+    def test_of_a_full_mask_nothing_is_told_twice(self) -> None:
+        sides = [whole_result(seeds=2, entropy=entropy) for entropy in (0, 1)]
+        for side in sides:
+            for case in side["cases"]:
+                case["metrics"]["whole"]["psnr"] = case["metrics"]["psnr"]
+        quantities = {row["quantity"] for row in compare_results(*sides)["rows"]}
+        assert "whole.psnr" not in quantities
+        assert "whole.ssim" in quantities
+
+
+class TestWhatIsNotAlike:
+    def asked(self, side: dict[str, Any], **known: Any) -> dict[str, Any]:
+        return {**side, "cases": [{**case, **known} for case in side["cases"]]}
+
+    def test_another_digest_is_told(self) -> None:
+        sides = [
+            self.asked(result(), asked=digest, settings={"coarse.iterations": iterations})
+            for digest, iterations in (("a", 500), ("b", 1500))
+        ]
+        assert compare_results(*sides)["other_settings"] == [
+            "coarse (quick) on phantom/0@sparse was asked for with other settings: "
+            "coarse.iterations = 500, now coarse.iterations = 1500"
+        ]
+        assert compare_results(sides[0], sides[0])["other_settings"] == []
+
+    def test_earlier_results_have_the_words_of_variants(self) -> None:
+        def worded(words: str) -> dict[str, Any]:
+            return {**result(), "methods": {"coarse": words}}
+
+        one, other = (worded(f"coarse with coarse.iterations = {number}") for number in (500, 1500))
+        (line,) = compare_results(one, other)["other_settings"]
+        assert "coarse.iterations = 500, now coarse with coarse.iterations = 1500" in line
+        # A method's description may be worded anew.
+        assert compare_results(worded("as it was"), worded("better said"))["other_settings"] == []
+        assert compare_results(result(), other)["other_settings"] == []
+
+    def test_memory_of_shared_stages_is_not_that_of_separate_ones(self) -> None:
+        before, after = (self.asked(result(), peak_mib=peak) for peak in (500.0, 900.0))
+        shared, separate = {"sharing": "once"}, {"sharing": "none"}
+        found = compare_results(before | shared, after | separate)
+        assert (found["times_judged"], found["memory_judged"]) == (True, False)
+        assert "peak_mib" not in verdicts(found)
+        assert "seconds" in verdicts(found)
+        assert verdicts(compare_results(before | shared, after | shared))["peak_mib"] == "worse"
+        assert verdicts(compare_results(before, after | shared))["peak_mib"] == "worse"
 
 
 def test_runs_that_fail_now_are_a_regression() -> None:
@@ -273,6 +482,7 @@ def _with(**changes: Any) -> dict[str, Any]:
         {"cases": [1]},
         {"cases": [{"method": "coarse"}]},
         {**result(), "machine": "x"},
+        {**result(), "methods": ["x"]},
         _with(sequence=["phantom/0"]),
         _with(seed={}),
         _with(image_size=[48]),

@@ -170,6 +170,23 @@ def test_a_single_seed_has_no_interval() -> None:
     assert "interval" not in text.split("Methods")[0]
 
 
+@pytest.mark.parametrize(
+    ("gains", "verdict"),
+    [
+        ((1.2, -0.9, 0.1), None),
+        ((1.2, 0.9, 1.1), "better"),
+        ((-1.2, -0.9, -1.1), "worse"),
+        ((2.0,), None),
+        ((0.0,), "equal"),
+    ],
+)
+def test_a_verdict_takes_an_interval_without_zero(gains: tuple[float, ...], verdict: str | None) -> None:
+    given = runs_of({f"phantom/{number}": gain for number, gain in enumerate(gains)}, seeds=1)
+    page = Page(build_benchmark_report(BenchmarkInputs("x", given, "3dgs", METHODS)))
+    cell = page.text.split("Differences to 3dgs")[1].split("PSNR, dB ↑")[1].split("better in")[0].split()
+    assert [word for word in cell if word in ("better", "worse", "equal")] == ([verdict] if verdict else [])
+
+
 def test_sources_that_tell_nothing_of_what_was_observed() -> None:
     runs = runs_of({"sinus/hopkins": 1.0})
     for item in runs:
@@ -211,7 +228,7 @@ def test_stages_that_runs_share_took_their_time_once(inputs: BenchmarkInputs) ->
 
 def test_depth_over_different_pixels_is_not_judged() -> None:
     def page_of(coverage: float) -> Page:
-        runs = runs_of({"phantom/0": 1.0}, seeds=2)
+        runs = runs_of({"phantom/0": 1.0, "phantom/1": 1.0}, seeds=2)
         for item in runs:
             fuller = item["method"] == "coarse"
             item["metrics"] |= {
@@ -241,7 +258,7 @@ def test_opposite_differences_in_coverage_do_not_cancel() -> None:
 
 def test_accuracy_of_less_of_the_surface_is_not_judged() -> None:
     def page_of(recall: float) -> str:
-        runs = runs_of({"phantom/0": 1.0}, seeds=2)
+        runs = runs_of({"phantom/0": 1.0, "phantom/1": 1.0}, seeds=2)
         for item in runs:
             better = item["method"] == "coarse"
             item["metrics"]["surface"] |= {

@@ -18,13 +18,14 @@ def row(sequence: str, method: str, psnr: float, **more: str) -> BoardRow:
 
 
 ROWS = [
-    row("phantom/1", "3dgs", 20.0),
+    row("phantom/1", "3dgs", 20.0, seed="0"),
     row("phantom/1", "extrags", 23.0, seed="0"),
     row("phantom/1", "extrags", 25.0, seed="1", link="file:///store/report.html"),
     row("phantom/2", "3dgs", 22.0),
     row("phantom/2", "extrags", 21.0),
     row("c3vd/cecum", "extrags", 40.0),
     BoardRow("c3vd/cecum", "3dgs", "quick", status="failed", reason="coarse: out of memory", ended="2026"),
+    row("phantom/1", "3dgs", 20.0, seed="1"),
 ]
 
 
@@ -34,12 +35,28 @@ def page() -> Page:
 
 
 def test_cells_are_means_over_seeds_and_the_best_is_marked(page: Page) -> None:
-    assert "phantom/1 20.00 24.00 best ± 1.41" in page.text
+    assert "phantom/1 20.00 ± 0.00 24.00 best ± 1.41" in page.text
     assert "phantom/2 22.00 best 21.00" in page.text
 
 
 def test_means_are_over_sequences_that_every_method_has(page: Page) -> None:
     assert "Mean of the 2 sequences that all methods have 21.00 22.50" in page.text
+
+
+def test_of_other_seeds_nothing_is_the_best() -> None:
+    """Whose hard seeds failed has the better mean."""
+    told = "Not all methods have figures of the same seeds on phantom/1 (quick): none is marked as best there"
+    lacking = [*ROWS[:5], replace(ROWS[-1], status="failed", metrics=None)]
+    page = Page(build_leaderboard(lacking))
+    assert told in page.text
+    assert "phantom/1 20.00 24.00 ± 1.41" in page.text
+    assert "phantom/2 22.00 best 21.00" in page.text
+    assert "all methods have 21.00 22.50 " in page.text
+    assert "22.50 best" not in page.text
+    assert "same seeds on" not in Page(build_leaderboard(ROWS)).text
+    # An oracle is no rival, whatever its seeds.
+    oracle = replace(ROWS[0], method="oracle", held_out_trained_on=True)
+    assert "same seeds on" not in Page(build_leaderboard([*ROWS, oracle])).text
 
 
 def test_failures_are_listed_with_their_reason(page: Page) -> None:
