@@ -20,10 +20,10 @@ from extrags import __version__
 from extrags.errors import ExtragsError
 from extrags.metrics.comparison import figure_of
 from extrags.metrics.registry import PROTOCOL_VERSION
+from extrags.metrics.regression import MACHINE, same_machine
 from extrags.store import Store, digest_of, read_records, write_record
 
 __all__ = [
-    "SAME_MACHINE",
     "BenchmarkRegressedError",
     "Judgement",
     "Tolerance",
@@ -39,9 +39,6 @@ FIGURES = ("observed.psnr", "psnr")
 
 READABLE_LETTERS = 190
 """Letters of a benchmark's name in the names of its records: file systems allow 255 in all."""
-
-SAME_MACHINE = ("processor", "cores", "threads", "isa")
-"""What must be equal for run times to be comparable; keys of `extrags.raster.bench.machine`."""
 
 
 class Tolerance(BaseModel):
@@ -122,7 +119,7 @@ def history_entry(
         "commit": machine["commit"],
         "version": __version__,
         "protocol": PROTOCOL_VERSION,
-        "machine": {key: machine[key] for key in (*SAME_MACHINE, "load_average")},
+        "machine": {key: machine[key] for key in (*MACHINE, "load_average")},
         "cases": [
             {
                 **{key: case[key] for key in ("method", "profile", "sequence", "setting", "seed", "error")},
@@ -188,7 +185,7 @@ def judge(entry: Mapping[str, Any], earlier: Sequence[Mapping[str, Any]], tolera
     found = Judgement()
     remark = f"of {len(earlier)} earlier runs comparable (at least {tolerance.at_least})"
     before = [_comparable(item, entry) for item in earlier]
-    same = [_same_machine(item, entry) for item in earlier]
+    same = [same_machine(item["machine"], entry["machine"]) for item in earlier]
     alike = [_same_protocol(item, entry) for item in earlier]
     for group, now in _comparable(entry, entry).items():
         label = _label(group)
@@ -266,7 +263,7 @@ def trend(entries: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
             methods[method] = {
                 "psnr": _mean(psnr) if psnr and measured_alike else None,
                 "seconds": fmean(found[group]["seconds"] for group in groups)
-                if _same_machine(entry, last)
+                if same_machine(entry["machine"], last["machine"])
                 else None,
             }
         drawn.append({**{key: entry[key] for key in ("when", "commit", "version")}, "methods": methods})
@@ -324,10 +321,6 @@ def _mean(values: Sequence[float | None]) -> float | None:
 def _label(group: tuple[str, ...]) -> str:
     method, profile, sequence, setting = group
     return f"{method} ({profile}) on {sequence}{f'@{setting}' if setting else ''}"
-
-
-def _same_machine(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
-    return all(one["machine"].get(key) == other["machine"].get(key) for key in SAME_MACHINE)
 
 
 def _same_protocol(earlier: Mapping[str, Any], entry: Mapping[str, Any]) -> bool:

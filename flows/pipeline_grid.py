@@ -22,10 +22,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from extrags.errors import ConfigError, ExtragsError
+from extrags.metrics.regression import MACHINE
 from extrags.output_files import write_file
 from extrags.store import digest_of
 from flows.budgets import Budget, reaching
-from flows.history import SAME_MACHINE
 from flows.outcome import NOT_COUNTED, StageRow
 from flows.selection import Chosen
 
@@ -335,9 +335,7 @@ def _shared_seconds(row: StageRow) -> float:
 
 def _claim(folder: Path, about: dict[str, Any], separate: bool) -> None:
     """Times of one machine and one version stand in one folder."""
-    mine = {name: about[name] for name in (*SAME_MACHINE, "device", "versions", "commit")} | {
-        "separate": separate
-    }
+    mine = {name: about[name] for name in (*MACHINE, "versions", "commit")} | {"separate": separate}
     file = folder / "grid.json"
     if not file.exists():
         _write(file, mine)

@@ -40,12 +40,14 @@ __all__ = [
     "COST_NAMES",
     "GROUP",
     "LEVEL",
+    "MACHINE",
     "MATTERS",
     "SITTING",
     "compare_results",
     "grouped_runs",
     "known_sizes",
     "repetition",
+    "same_machine",
 ]
 
 LEVEL = 0.05
@@ -74,7 +76,8 @@ UNITS = {"cost": "share", "dB": "dB", "other": "share", "absolute": "absolute"}
 SIZE = ("width", "height")
 GROUP = ("method", "profile", "budget", "sequence", "setting", *SIZE)
 """What runs have in common that differ in seed and repeat alone."""
-MACHINE = ("processor", "cores", "threads", "isa")
+MACHINE = ("processor", "cores", "threads", "isa", "device")
+"""What must be equal for run times to be comparable; keys of `extrags.raster.bench.machine`."""
 
 Verdict = Literal["worse", "better", "noise", "equal", "not judged"]
 
@@ -143,6 +146,15 @@ class _Row:
         }
 
 
+def same_machine(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    """Whether results are of one kind of machine: times of others are not compared.
+
+    Results from before the device was recorded say nothing of it; theirs is not compared.
+    """
+    keys = [key for key in MACHINE if key != "device" or (one.get(key) and other.get(key))]
+    return all(one.get(key) == other.get(key) for key in keys)
+
+
 def compare_results(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:
     """Compare two results of `bench pipeline` or `benchmark`.
 
@@ -179,9 +191,7 @@ def compare_results(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict
     common = [group for group in sides[0] if group in sides[1]]
     if not common:
         raise ConfigError("the two results have no method, budget, sequence and size of images in common")
-    same = all(
-        (before.get("machine") or {}).get(key) == (after.get("machine") or {}).get(key) for key in MACHINE
-    )
+    same = same_machine(before.get("machine") or {}, after.get("machine") or {})
     protocols = [_protocol(document) for document in (before, after)]
     sharing = [document.get("sharing") for document in (before, after)]
     same_sharing = None in sharing or sharing[0] == sharing[1]

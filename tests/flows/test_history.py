@@ -35,6 +35,7 @@ MACHINE = {
     "cores": 2,
     "threads": 2,
     "isa": "avx2",
+    "device": "cpu",
     "load_average": 0.5,
     "commit": "0123456789abcdef",
 }

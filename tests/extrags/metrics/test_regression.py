@@ -90,6 +90,12 @@ class TestVerdicts:
         assert not found["times_judged"]
         assert set(verdicts(found)) == {"psnr"}
 
+    def test_times_of_a_processor_and_of_a_gpu_are_not_judged_unless_nobody_said(self) -> None:
+        on_gpu = {**MACHINE, "device": "NVIDIA H200"}
+        before = result(machine={**MACHINE, "device": "cpu"})
+        assert not compare_results(before, result(slower=9, machine=on_gpu))["times_judged"]
+        assert compare_results(result(), result(slower=9, machine=on_gpu))["times_judged"]
+
     def test_figures_of_two_versions_of_the_protocol_are_not_judged(self) -> None:
         before = result() | {"protocol": 6}
         after = result(worse_db=4, slower=2) | {"protocol": 7}
