@@ -357,6 +357,8 @@ class TestHiddenDepth:
         assert len(record["restorer"]) == len(record["completion"]) == 32
         weights = load_safetensors(out / "hidden.safetensors")
         CompletionNetwork().load_state_dict({name: value.float() for name, value in weights.items()})
+        # Whoever may read the record may read the weights.
+        assert (out / "hidden.safetensors").stat().st_mode == (out / "hidden.json").stat().st_mode
         # What could be explored is kept.
         assert main([*given, "--output", str(tmp_path / "again")]) == 0
         assert made[3:] == ["cavities 0"]
