@@ -296,7 +296,7 @@ def checked(given: argparse.Namespace, scenes: int, validation_scenes: int, *, p
     """
     from extrags.metrics.lpips_weights import find_weights
 
-    if validation_scenes >= scenes:
+    if validation_scenes >= scenes and not given.scenes_only:
         raise ConfigError(f"{validation_scenes} of {scenes} scenes are for validation; none is left to train")
     for name, least in (("workers", 1), ("threads", 1), ("size_factor", 1), ("first_scene", 0)):
         value = getattr(given, name)
