@@ -190,6 +190,13 @@ def test_what_would_fail_after_hours_is_said_at_once(
     assert "--output" in capsys.readouterr().err
     assert main(["pretrain", *out, "--workers", "0"]) == 2
     assert "--workers 0" in capsys.readouterr().err
+    refused = "extrags pretrain: setting learning_rate is -1.0; expected a number above 0\n"
+    assert main(["pretrain", *out, "--learning-rate", "-1"]) == 2
+    assert capsys.readouterr().err.endswith(refused)
+    assert main(["pretrain", *out, "--generative", "--without-perceptual"]) == 2
+    told = capsys.readouterr().err
+    assert "extrags pretrain: generative needs the perceptual distance" in told
+    assert "validation error" not in told
     (tmp_path / "file").write_text("")
     assert main(["pretrain", "--output", str(tmp_path / "file" / "w"), "--without-perceptual"]) == 2
     assert "cannot be written" in capsys.readouterr().err
