@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from extrags.errors import ConfigError
+from extrags.errors import CaptureError, ConfigError
 from flows.commands.common import set_up_logging, showing, training_settings
 from flows.commands.options import Parser, add_output
 from flows.commands.outputs import output_folder
@@ -237,6 +237,7 @@ def pretrain(given: argparse.Namespace) -> int:
             folder = folder / FOLDER
         else:
             files = make_scenes(folder, sources, given.workers)
+            check_enough(len(files), config.scenes, 0 if given.scenes_only else config.validation_scenes)
         if given.scenes_only:
             console().print(f"{len(files)} scenes in {folder}", markup=False)
             return 0
@@ -249,6 +250,7 @@ def pretrain(given: argparse.Namespace) -> int:
             refiner.save(Path(given.output))
             return _told(refiner.record, given.output)
         checkpoint = Path(given.output) / CHECKPOINT
+        config = for_scenes(config, len(files))
         enhancer = trained(files, config, start, checkpoint=checkpoint)
         replace(enhancer, record={**enhancer.record, **about}).save(Path(given.output), half=True)
         if enhancer.record["iterations_made"] >= config.iterations:
@@ -268,6 +270,33 @@ def _settings(given: argparse.Namespace) -> PretrainingConfig:
     further = ("error_weight", "deterministic", "generative", "seed", "perceptual")
     given = argparse.Namespace(**vars(given), perceptual=not given.without_perceptual)
     return training_settings(given, PretrainingConfig, (*names, *further), "extrags pretrain")
+
+
+def check_enough(made: int, wanted: int, validation_scenes: int) -> None:
+    """Refuse to go on where too few scenes could be made.
+
+    Args:
+        made: scenes that there are.
+        wanted: scenes asked for.
+        validation_scenes: how many of them validate only.
+
+    Raises:
+        CaptureError: when no scene is left beside those.
+    """
+    if made <= validation_scenes:
+        validate = f", and {validation_scenes} are for validation" if validation_scenes else ""
+        raise CaptureError(
+            f"{made} of {wanted} scenes could be made{validate}; none is left. More --scenes, or others "
+            "(--first-scene), may give some"
+        )
+
+
+def for_scenes(config: PretrainingConfig, made: int) -> PretrainingConfig:
+    """The settings for those scenes that could be made, with one drawing process for each at most."""
+    most = made - config.validation_scenes
+    return config.model_copy(
+        update={"scenes": made, "drawing_processes": min(config.drawing_processes, most)}
+    )
 
 
 def _told(record: dict[str, Any], folder: str) -> int:

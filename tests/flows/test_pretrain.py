@@ -13,11 +13,12 @@ import torch
 from extrags.array_files import load_safetensors
 from extrags.cameras import Cameras
 from extrags.depth.completion import CompletionNetwork
-from extrags.errors import CaptureError
+from extrags.errors import CaptureError, DivergedError
 from extrags.events import Progress, subscribed
 from extrags.metrics.lpips import Lpips
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.diffusion.network import build_network
+from extrags.restoration.diffusion.pretraining import PretrainingConfig
 from extrags.restoration.hidden_depth.examples import HiddenDepthExamples
 from extrags.restoration.refinement.refiner import Refiner
 from extrags.restoration.surface_texture import SurfaceTexture
@@ -28,6 +29,7 @@ from extrags.view_synthesis.gamut import Gamut
 from extrags.view_synthesis.references import LightTransfer
 from flows.cli import main
 from flows.commands import pretrain_scenes
+from flows.commands.pretrain import for_scenes
 from flows.commands.pretrain_refiner import examples_of, start_of_refiner
 from flows.commands.pretrain_scenes import SceneSource, make_scenes, scene_sources
 from tests.extrags.random_lpips import random_weights
@@ -119,6 +121,58 @@ def test_scenes_alone_train_nothing(scenes: Path, capsys: pytest.CaptureFixture[
     assert main(["pretrain", "--scenes-only", "--scenes-folder", str(scenes), "--scenes", "3"]) == 0
     assert "3 scenes in" in capsys.readouterr().out
     assert len(list(scenes.iterdir())) == 3
+
+
+class TestScenesThatCannotBeMade:
+    @pytest.fixture(autouse=True)
+    def poor(self, scenes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        """The second of three scenes has yet to be made, and its reconstruction diverges."""
+        (scenes / sources()[1].file_name).unlink()
+
+        def diverged(*_given: object, **_named: object) -> PretrainingScene:
+            raise DivergedError("pretraining-scene: the loss is not finite at iteration 3")
+
+        monkeypatch.setattr(pretrain_scenes, "ProcessPoolExecutor", _Here)
+        monkeypatch.setattr(pretrain_scenes, "_on_one_thread", lambda job: job())
+        monkeypatch.setattr(SceneSource, "recording", lambda source: None)
+        module = "extrags.restoration.training_data.pretraining_scenes.make_pretraining_scene"
+        monkeypatch.setattr(module, diverged)
+
+    def test_they_are_left_out(
+        self,
+        scenes: Path,
+        tmp_path: Path,
+        capsys: pytest.CaptureFixture[str],
+        caplog: pytest.LogCaptureFixture,
+    ) -> None:
+        common = ["pretrain", "--scenes-folder", str(scenes), "--scenes", "3", "--validation-scenes", "1"]
+        assert main([*common, "--scenes-only"]) == 0
+        assert "2 scenes in" in capsys.readouterr().out
+        assert "cavities_00000: left out, pretraining-scene: the loss is not finite" in caplog.text
+        given = ["--iterations", "1", "--batch", "1", "--without-perceptual", "--threads", "1"]
+        given += ["--set", "channels=8,16,16", "--output", str(tmp_path / "w")]
+        assert main([*common, *given]) == 0
+        record = json.loads((tmp_path / "w" / "restorer.json").read_text())["record"]
+        assert record["pretraining"]["scenes"] == 2
+
+    def test_too_few_others_are_told(
+        self, scenes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        common = ["pretrain", "--scenes-folder", str(scenes), "--without-perceptual"]
+        given = ["--output", str(tmp_path / "w"), "--scenes", "3", "--validation-scenes", "2"]
+        assert main([*common, *given]) != 0
+        assert (
+            "2 of 3 scenes could be made, and 2 are for validation; none is left" in capsys.readouterr().err
+        )
+        only = ["--scenes-only", "--kinds", "cavities", "--first-scene", "7", "--scenes", "2"]
+        assert main([*common, *only]) != 0
+        assert "0 of 2 scenes could be made; none is left" in capsys.readouterr().err
+
+    def test_processes_are_as_many_as_the_scenes_at_most(self) -> None:
+        config = PretrainingConfig(scenes=9, validation_scenes=2, drawing_processes=7)
+        fewer = for_scenes(config, 5)
+        assert (fewer.scenes, fewer.drawing_processes) == (5, 3)
+        assert for_scenes(config, 9) == config
 
 
 class _Here:

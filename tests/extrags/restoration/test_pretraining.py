@@ -11,7 +11,7 @@ import torch
 
 from extrags.array_files import load_safetensors, save_safetensors
 from extrags.config import CoarseConfig, profile_config
-from extrags.errors import ConfigError, WeightsError
+from extrags.errors import CaptureError, ConfigError, WeightsError
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.diffusion.frame_features import frame_features
 from extrags.restoration.diffusion.network import build_network
@@ -126,10 +126,21 @@ class TestPretrainingScene:
     ) -> None:
         monkeypatch.setattr("extrags.restoration.training_data.degradation.ITERATIONS", (10, 20))
         monkeypatch.setattr("extrags.restoration.training_data.degradation._WITH_LIGHT", 1.0)
-        module = "extrags.restoration.training_data.explored_views.explore"
-        monkeypatch.setattr(module, lambda *_given, **_named: type("Nothing", (), {"trajectories": ()}))
+        module = "extrags.restoration.training_data.explored_views"
+        monkeypatch.setattr(
+            f"{module}.explore", lambda *_given, **_named: type("Nothing", (), {"trajectories": ()})
+        )
         found = make_pretraining_scene(tube_recording(tube), RUN, 3, explored=True)
         assert torch.equal(found.pairs.layers.data, scene.pairs.layers.data)
+
+        def too_poor(*_given: object, **_named: object) -> None:
+            raise CaptureError("the fused depth of 10 views holds no surface")
+
+        for step in ("fuse_surface", "carve"):
+            with monkeypatch.context() as patch:
+                patch.setattr(f"{module}.{step}", too_poor)
+                found = make_pretraining_scene(tube_recording(tube), RUN, 3, explored=True)
+            assert torch.equal(found.pairs.layers.data, scene.pairs.layers.data)
 
     def test_training_frames_are_kept_as_references(self, tube: Tube, scene: PretrainingScene) -> None:
         train = tube.sequence.train
