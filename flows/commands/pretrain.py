@@ -191,7 +191,7 @@ def pretrain(given: argparse.Namespace) -> int:
 
     from extrags.raster.bench import machine
     from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
-    from extrags.restoration.diffusion.pretraining import PretrainingConfig, check_settings
+    from extrags.restoration.diffusion.pretraining import PretrainingConfig, check_settings, check_sizes
     from extrags.restoration.diffusion.pretraining import pretrain as trained
     from extrags.restoration.diffusion.weights import COLONS, starting_weights
     from extrags.restoration.hidden_depth.training import HiddenDepthConfig
@@ -218,6 +218,7 @@ def pretrain(given: argparse.Namespace) -> int:
     )
     checked(given, config.scenes, config.validation_scenes, perceptual=perceptual)
     start = None
+    sources = scene_sources(given, config.scenes)
     if isinstance(config, HiddenDepthConfig):
         begun = beginning(given.start or COLONS, config.completion)
     elif isinstance(config, RefinerConfig):
@@ -227,9 +228,11 @@ def pretrain(given: argparse.Namespace) -> int:
             start = EmbeddedEnhancer.load(starting_weights(given.start)).without_scene()
         if not given.scenes_only:
             check_settings(config, start)
+            # Those that validate may be of any size.
+            trained_on = (source.config for source in sources[: -config.validation_scenes])
+            check_sizes(config, [(scene.height, scene.width) for scene in trained_on])
     # As things are now: in some hours the working tree may be another.
     about: dict[str, Any] = {"command": _command(given), "machine": machine()}
-    sources = scene_sources(given, config.scenes)
     with progress_display(showing(given)), reporting("restorer", "pretrain"):
         folder = Path(given.scenes_folder)
         if isinstance(config, HiddenDepthConfig):

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from argparse import Namespace
 from dataclasses import replace
 from importlib.resources import files
@@ -18,7 +19,7 @@ from extrags.events import Progress, subscribed
 from extrags.metrics.lpips import Lpips
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.diffusion.network import build_network
-from extrags.restoration.diffusion.pretraining import PretrainingConfig
+from extrags.restoration.diffusion.pretraining import PretrainingConfig, check_settings, check_sizes
 from extrags.restoration.hidden_depth.examples import HiddenDepthExamples
 from extrags.restoration.refinement.refiner import Refiner
 from extrags.restoration.surface_texture import SurfaceTexture
@@ -29,7 +30,8 @@ from extrags.view_synthesis.gamut import Gamut
 from extrags.view_synthesis.references import LightTransfer
 from flows.cli import main
 from flows.commands import pretrain_scenes
-from flows.commands.pretrain import for_scenes
+from flows.commands.options import Parser
+from flows.commands.pretrain import _settings, add_arguments, for_scenes
 from flows.commands.pretrain_refiner import examples_of, start_of_refiner
 from flows.commands.pretrain_scenes import SceneSource, make_scenes, scene_sources
 from tests.extrags.random_lpips import random_weights
@@ -267,11 +269,30 @@ def test_settings_that_do_not_fit_are_told_before_a_scene_is_made(
     given += ["--scenes", "3", "--validation-scenes", "1", "--without-perceptual"]
     assert main([*given, "--set", "drawing_processes=3"]) == 2
     assert "there are 2 scenes to train on" in capsys.readouterr().err
+    # Phantoms of 176 x 112 px are among them.
+    assert main([*given, "--scenes", "30", "--set", "crop=128"]) == 2
+    assert "crop=128: images of some scenes (176x112 px) are too small for it" in capsys.readouterr().err
     network = build_network(CONDITION_CHANNELS, (8, 16, 16), torch.Generator().manual_seed(1))
     start = EmbeddedEnhancer(network, 1, 1, 0, False, Gamut(0.0, 1e6, 0.0, 1e6), {})
     start.save(tmp_path / "start")
     assert main([*given, "--start", str(tmp_path / "start")]) == 2
     assert "the weights to start from have channels (8, 16, 16)" in capsys.readouterr().err
+
+
+def test_documented_trainings_fit_their_scenes() -> None:
+    document = Path(__file__).parents[2] / "docs" / "restorer_weights.md"
+    lines = [line for line in document.read_text().splitlines() if line.startswith("extrags pretrain ")]
+    others = ("--refiner", "--hidden-depth", "--scenes-only")
+    commands = [line for line in lines if not any(option in line for option in others)]
+    assert any("--generative" in command for command in commands)
+    for command in commands:
+        parser = Parser()
+        add_arguments(parser)
+        given = parser.parse_args(shlex.split(command)[2:])
+        config = _settings(given)
+        scenes = [source.config for source in scene_sources(given, config.scenes)]
+        check_settings(config.model_copy(update={"device": "cpu"}), None)
+        check_sizes(config, [(scene.height, scene.width) for scene in scenes])
 
 
 def test_the_weights_of_the_package_say_where_they_come_from() -> None:

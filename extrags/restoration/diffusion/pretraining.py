@@ -33,6 +33,7 @@ from extrags.restoration.diffusion.network_training import NetworkTraining, Trai
 from extrags.restoration.diffusion.precision import has_fast_half_precision
 from extrags.restoration.diffusion.validation import validation_scores
 from extrags.restoration.training_data.augmentation import (
+    PATCH_SIDE_MULTIPLE,
     Batch,
     CropSampler,
     MixedSampler,
@@ -44,7 +45,7 @@ from extrags.restoration.uncertainty.domain import Domain
 from extrags.view_synthesis.conditioning import CONDITION_CHANNELS, INVENTED_CHANNELS, Layers
 from extrags.view_synthesis.gamut import Gamut
 
-__all__ = ["PretrainingConfig", "check_settings", "pretrain"]
+__all__ = ["PretrainingConfig", "check_settings", "check_sizes", "pretrain"]
 
 ANY_HUE = Gamut(0.0, 1e6, 0.0, 1e6)
 MAX_STEPS = 4
@@ -141,7 +142,8 @@ def pretrain(
             processes, not with other settings. None keeps none.
 
     Raises:
-        ConfigError: when the number of files does not fit the settings, or as `check_settings`.
+        ConfigError: when the number of files does not fit the settings, or as `check_settings` and
+            `check_sizes`.
         WeightsError: when a file is not a pretraining scene, the perceptual distance has no weights, or the
             checkpoint is of a training with other settings.
         DivergedError: when the loss stops being finite.
@@ -152,6 +154,8 @@ def pretrain(
             f"{config.validation_scenes} are for validation"
         )
     device = check_settings(config, start)
+    kept, unseen = files[: -config.validation_scenes], files[-config.validation_scenes :]
+    check_sizes(config, [PretrainingScene.size_of(file) for file in kept])
     perceptual = Lpips.load(net="squeeze").to(device) if config.perceptual else None
     generator = torch.Generator().manual_seed(config.seed)
     network = _starting_network(config, start, generator).to(device)
@@ -175,7 +179,7 @@ def pretrain(
         _go_on(training, checkpoint, config)
         generator.manual_seed(config.seed + training.iteration)
         logger.info("%s: going on from %s, step %d", stage, checkpoint, training.iteration)
-    sampler = partial(_mixed_sampler, files[: -config.validation_scenes], config, training.iteration)
+    sampler = partial(_mixed_sampler, kept, config, training.iteration)
     with drawn_in_processes(sampler, config.drawing_processes) as draw:
         _train(training, draw, config, checkpoint)
     network, history = training.finished().cpu(), training.history
@@ -189,7 +193,6 @@ def pretrain(
     trained = EmbeddedEnhancer(
         network, 1, 1, config.seed, half, ANY_HUE, record, deterministic=config.deterministic
     )
-    kept, unseen = files[: -config.validation_scenes], files[-config.validation_scenes :]
     return replace(_scored(trained, unseen, config), domain=_domain(trained, kept, unseen))
 
 
@@ -221,6 +224,30 @@ def check_settings(config: PretrainingConfig, start: EmbeddedEnhancer | None) ->
         if start.network.generative and not config.generative:
             raise ConfigError("the weights to start from are generative; set generative as well")
     return chosen_device(config.device, "pretraining.device")
+
+
+def check_sizes(config: PretrainingConfig, sizes: Sequence[tuple[int, int]]) -> None:
+    """Look whether one size of crops and of patches fits all scenes: those of a batch come from several.
+
+    Args:
+        config: budget.
+        sizes: height and width in pixels of the images of each scene that is trained on.
+
+    Raises:
+        ConfigError: when crops or patches would be smaller in some scenes than in others; says which size
+            fits all.
+    """
+    asked = {"crop": (config.crop, SIZE_MULTIPLE)}
+    if config.generative:
+        asked["patch_px"] = (config.patch_px, PATCH_SIDE_MULTIPLE)
+    for name, (side, multiple) in asked.items():
+        found = {min(side, *size) // multiple * multiple: size for size in sizes}
+        if len(found) > 1:
+            height, width = found[min(found)]
+            raise ConfigError(
+                f"{name}={side}: images of some scenes ({width}x{height} px) are too small for it, and "
+                f"all of a batch have one size; set {name}={min(found)}"
+            )
 
 
 def _train(
@@ -292,12 +319,6 @@ def _mixed_sampler(
         for index, file in enumerate(files)
         if index % processes == number
     ]
-    smallest = min(samplers, key=lambda sampler: sampler.side_px)
-    if smallest.side_px < max(sampler.side_px for sampler in samplers):
-        raise ConfigError(
-            f"crop={config.crop}: images of some scenes are too small for it, and a batch has crops of one "
-            f"size; set crop={smallest.side_px}"
-        )
     seed = config.seed + iteration + 1_000_003 * number
     return MixedSampler(samplers, batch=config.batch, seed=seed).draw
 

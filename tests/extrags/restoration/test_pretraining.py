@@ -1,9 +1,12 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from multiprocessing import current_process
 from pathlib import Path
+from queue import Queue
 
 import numpy as np
 import pytest
@@ -15,7 +18,14 @@ from extrags.errors import CaptureError, ConfigError, WeightsError
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.diffusion.frame_features import frame_features
 from extrags.restoration.diffusion.network import build_network
-from extrags.restoration.diffusion.pretraining import PretrainingConfig, _mixed_sampler, pretrain
+from extrags.restoration.diffusion.pretraining import (
+    PretrainingConfig,
+    _mixed_sampler,
+    check_sizes,
+    pretrain,
+)
+from extrags.restoration.training_data import parallel
+from extrags.restoration.training_data.augmentation import Batch
 from extrags.restoration.training_data.parallel import drawn_in_processes
 from extrags.restoration.training_data.pretraining_scenes import (
     PRETRAINING_DATA_VERSION,
@@ -280,8 +290,46 @@ class TestPretraining:
         )
         small = tmp_path / "small.safetensors"
         replace(scene, pairs=lower, references=scene.references).save(small)
-        with pytest.raises(ConfigError, match=r"crop=48: images of some scenes are too small.*set crop=40"):
+        told = r"crop=48: images of some scenes \(64x40 px\) are too small.*set crop=40"
+        with pytest.raises(ConfigError, match=told):
             pretrain([files[0], small, files[1]], TINY.model_copy(update={"crop": 48}))
+
+    def test_patches_of_several_sizes_are_refused(self) -> None:
+        config = PretrainingConfig(generative=True, crop=96, patch_px=128)
+        check_sizes(config, [(144, 160), (128, 160)])
+        with pytest.raises(
+            ConfigError, match=r"patch_px=128: .* \(176x112 px\) are too small.*set patch_px=112"
+        ):
+            check_sizes(config, [(144, 160), (112, 176)])
+        # Others show no patches.
+        check_sizes(config.model_copy(update={"generative": False}), [(144, 160), (112, 176)])
+
+    def test_a_file_that_is_no_scene_has_no_size(self, tmp_path: Path) -> None:
+        (tmp_path / "x.safetensors").write_bytes(b"nothing")
+        save_safetensors(tmp_path / "y.safetensors", {"other": torch.zeros(1)})
+        for name in ("x", "y"):
+            with pytest.raises(WeightsError, match=rf"{name}\.safetensors: not the pairs"):
+                PretrainingScene.size_of(tmp_path / f"{name}.safetensors")
+
+    def test_what_a_process_raises_is_told(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(torch, "set_num_threads", lambda _count: None)
+
+        def refused(number: int, workers: int) -> Callable[[], Batch]:
+            raise ConfigError(f"process {number} of {workers}: images are too small")
+
+        given: Queue = Queue()
+        parallel._draw(refused, 1, 2, given)
+        with pytest.raises(ConfigError, match="process 1 of 2: images are too small"):
+            parallel._taken(given, current_process())
+
+    @pytest.mark.slow  # Each of them imports torch.
+    def test_what_a_process_raises_is_told_by_its_parent(self, tmp_path: Path) -> None:
+        missing = partial(_mixed_sampler, [tmp_path / "gone.safetensors"] * 2, TINY, 0)
+        with (
+            drawn_in_processes(missing, 2) as draw,
+            pytest.raises(WeightsError, match=r"gone\.safetensors: not the pairs"),
+        ):
+            draw()
 
     def test_more_processes_than_scenes_are_refused(self, files: list[Path]) -> None:
         with pytest.raises(ConfigError, match="drawing_processes=3: there are 2 scenes"):
