@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from extrags.errors import CaptureError, ConfigError
+from extrags.errors import CaptureError, ConfigError, WeightsError
 from flows.commands.common import set_up_logging, showing, training_settings
 from flows.commands.options import Parser, add_output
 from flows.commands.outputs import output_folder
@@ -322,7 +322,8 @@ def checked(given: argparse.Namespace, scenes: int, validation_scenes: int, *, p
         perceptual: whether the perceptual distance is needed.
 
     Raises:
-        ConfigError: for settings that do not fit each other, or a folder that cannot be written.
+        ConfigError: for settings that do not fit each other, a folder that cannot be written, or one that
+            holds another kind of weights.
         WeightsError: when the perceptual distance has no weights.
         SourceNotFoundError: when real textures are asked for and not on this machine.
     """
@@ -338,6 +339,8 @@ def checked(given: argparse.Namespace, scenes: int, validation_scenes: int, *, p
         raise ConfigError(f"--exact-share {given.exact_share}: expected a number from 0 to 1")
     if given.output is None and not given.scenes_only:
         raise ConfigError("--output: where do the weights go? (--scenes-only makes scenes alone)")
+    if given.output is not None and not (given.scenes_only or given.hidden_depth):
+        check_other_weights(Path(given.output), "refiner" if given.refiner else "embedded")
     if given.real_textures:
         from data_catalog.cavities.real_textures import texture_files
 
@@ -351,6 +354,32 @@ def checked(given: argparse.Namespace, scenes: int, validation_scenes: int, *, p
             Path(folder).mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise ConfigError(f"{folder} cannot be written: {error.strerror or error}") from error
+
+
+def check_other_weights(folder: Path, backend: str) -> None:
+    """Refuse a folder whose weights would lose their description.
+
+    Those of restorers and refiners have one name: the one that is written last is the only one.
+
+    Args:
+        folder: where weights go; need not be there.
+        backend: what they are of, as their description says.
+
+    Raises:
+        ConfigError: when the folder holds the description of another kind of weights.
+    """
+    from extrags.restoration.description import DESCRIPTION, read_description
+
+    try:
+        found = read_description(folder / DESCRIPTION).get("backend")
+    except WeightsError:
+        # None there, or one that nothing can read: no weights would be lost.
+        return
+    if found != backend:
+        raise ConfigError(
+            f"--output {folder}: {DESCRIPTION} there describes other weights (backend {found}), and would be "
+            f"overwritten by that of these ({backend}); take another folder"
+        )
 
 
 def _command(given: argparse.Namespace) -> str:

@@ -356,6 +356,26 @@ class TestRefiner:
         assert main([*given, "--output", str(tmp_path / "again")]) == 0
         assert [file.stat().st_mtime_ns for file in kept] == before
 
+    def test_weights_of_another_kind_are_not_overwritten(
+        self, given: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        """Restorers and refiners have descriptions of one name."""
+        refiner, restorer = tmp_path / "refiner", tmp_path / "restorer"
+        plain = [item for item in given if item not in ("--refiner", "--set", "crop=64")]
+        plain += ["--without-perceptual", "--set", "channels=8,16,16"]
+        assert main([*given, "--output", str(refiner)]) == 0
+        assert main([*plain, "--output", str(restorer)]) == 0
+        capsys.readouterr()
+        for arguments, folder in (plain, refiner), (given, restorer):
+            before = (folder / "restorer.json").read_bytes()
+            assert main([*arguments, "--output", str(folder)]) == 2
+            assert f"--output {folder}: restorer.json there" in capsys.readouterr().err
+            assert (folder / "restorer.json").read_bytes() == before
+        assert Refiner.load(refiner).record["iterations_made"] == 2
+        assert EmbeddedEnhancer.load(restorer).record["iterations_made"] == 2
+        # Its own kind may be trained anew.
+        assert main([*given, "--output", str(refiner)]) == 0
+
     def test_a_scene_without_texture_is_done_too(self, tmp_path: Path) -> None:
         file = tmp_path / "scene.safetensors"
         small_scene(0).save(file)
