@@ -146,7 +146,7 @@ def pretrain(
             `check_sizes`.
         WeightsError: when a file is not a pretraining scene, the perceptual distance has no weights, or the
             checkpoint is of a training with other settings.
-        DivergedError: when the loss stops being finite.
+        DivergedError: when the loss or a weight stops being finite.
     """
     if len(files) != config.scenes or config.validation_scenes >= config.scenes:
         raise ConfigError(
@@ -276,7 +276,12 @@ def _train(
 
 
 def _write(file: Path, training: NetworkTraining, config: PretrainingConfig) -> None:
-    """A checkpoint, with the settings that shaped the training so far."""
+    """A checkpoint, with the settings that shaped the training so far.
+
+    Raises:
+        DivergedError: when a weight is not finite: no training goes on from there.
+    """
+    training.check_finite()
     settings = torch.frombuffer(bytearray(json.dumps(_lasting(config)).encode()), dtype=torch.uint8)
     save_safetensors(file, {**training.state(), SETTINGS: settings})
 

@@ -7,6 +7,7 @@ from functools import partial
 from multiprocessing import current_process
 from pathlib import Path
 from queue import Queue
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,10 +15,11 @@ import torch
 
 from extrags.array_files import load_safetensors, save_safetensors
 from extrags.config import CoarseConfig, profile_config
-from extrags.errors import CaptureError, ConfigError, WeightsError
+from extrags.errors import CaptureError, ConfigError, DivergedError, WeightsError
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.diffusion.frame_features import frame_features
 from extrags.restoration.diffusion.network import build_network
+from extrags.restoration.diffusion.network_training import NetworkTraining
 from extrags.restoration.diffusion.pretraining import (
     PretrainingConfig,
     _mixed_sampler,
@@ -275,6 +277,24 @@ class TestPretraining:
         history = pretrain(files, longer, checkpoint=checkpoint).record["history"]
         assert [entry["iteration"] for entry in history] == [10, 12, 20]
         assert history[:2] == first
+
+    def test_weights_that_are_not_finite_end_it(
+        self, files: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """The loss of the last step is that of the weights before it."""
+        descend = NetworkTraining._descend
+
+        def last_one_diverges(training: NetworkTraining, *given: Any) -> None:
+            descend(training, *given)
+            if training.iteration == TINY.iterations - 1:
+                next(training.network.parameters()).data.fill_(float("nan"))
+
+        monkeypatch.setattr(NetworkTraining, "_descend", last_one_diverges)
+        checkpoint = tmp_path / "checkpoint.safetensors"
+        for file in (None, checkpoint):
+            with pytest.raises(DivergedError, match="weights are not finite after iteration 12"):
+                pretrain(files, TINY, checkpoint=file)
+        assert not checkpoint.exists()
 
     def test_crops_of_several_sizes_are_refused(
         self, scene: PretrainingScene, files: list[Path], tmp_path: Path
