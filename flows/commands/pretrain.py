@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -254,8 +253,8 @@ def pretrain(given: argparse.Namespace) -> int:
             return _told(refiner.record, given.output)
         checkpoint = Path(given.output) / CHECKPOINT
         config = for_scenes(config, len(files))
-        enhancer = trained(files, config, start, checkpoint=checkpoint)
-        replace(enhancer, record={**enhancer.record, **about}).save(Path(given.output), half=True)
+        enhancer = trained(files, config, start, checkpoint=checkpoint, about=about)
+        enhancer.save(Path(given.output), half=True)
         if enhancer.record["iterations_made"] >= config.iterations:
             checkpoint.unlink()
     return _told(enhancer.record, given.output)

@@ -230,6 +230,14 @@ def test_any_setting_can_be_given_and_an_ended_training_goes_on(
         assert record["iterations_made"] == made
     assert (tmp_path / "w" / "checkpoint.safetensors").exists()
     assert "--set channels=8,16,16" in record["command"]
+    # The command of the beginning, and those that went on.
+    assert main([*given, "--iterations", "700"]) == 0
+    record = json.loads((tmp_path / "w" / "restorer.json").read_text())["record"]
+    assert "--iterations" not in record["command"]
+    first, second = record["resumed"]
+    assert "--iterations" not in first["command"]
+    assert "--iterations 700" in second["command"]
+    assert second["machine"] == record["machine"]
     assert main([*given, "--set", "drawn=1"]) == 2
     assert "drawn_share" in capsys.readouterr().err
     assert main([*given, "--set", "most_seconds=-1"]) == 2

@@ -263,10 +263,42 @@ class TestPretraining:
         short = TINY.model_copy(update={"most_seconds": 1e-3})
         pretrain(files, short, checkpoint=checkpoint)
         state = load_safetensors(checkpoint)
-        del state["settings"]
+        del state["settings"], state["beginning"]
         save_safetensors(checkpoint, state)
         other = short.model_copy(update={"learning_rate": 1e-3})
-        assert pretrain(files, other, checkpoint=checkpoint).record["iterations_made"] == 2
+        record = pretrain(files, other, checkpoint=checkpoint, about={"command": "second"}).record
+        assert record["iterations_made"] == 2
+        assert (record["before"], record["command"]) == ("unknown", "unknown")
+        # It stays unknown.
+        record = pretrain(files, other, checkpoint=checkpoint, about={"command": "third"}).record
+        assert record["command"] == "unknown"
+        assert [later["command"] for later in record["resumed"]] == ["second", "third"]
+
+    def test_it_goes_on_from_the_weights_that_it_began_with(self, files: list[Path], tmp_path: Path) -> None:
+        checkpoint = tmp_path / "checkpoint.safetensors"
+        short = TINY.model_copy(update={"most_seconds": 1e-3})
+        starts = [
+            EmbeddedEnhancer(
+                build_network(
+                    CONDITION_CHANNELS, TINY.channels, torch.Generator().manual_seed(seed), generative=False
+                ),
+                *(1, 1, 0, False, Gamut(0.0, 1e6, 0.0, 1e6)),
+                {"command": f"start {seed}"},
+            )
+            for seed in range(2)
+        ]
+        first = pretrain(files, short, starts[0], checkpoint=checkpoint, about={"command": "first"}).record
+        assert "resumed" not in first
+        for other in (starts[1], None):
+            with pytest.raises(WeightsError, match="it began with other weights"):
+                pretrain(files, short, other, checkpoint=checkpoint)
+        # The same weights, though their record is worded otherwise.
+        same = replace(starts[0], record={"command": "moved"})
+        record = pretrain(files, short, same, checkpoint=checkpoint, about={"command": "second"}).record
+        assert record["iterations_made"] == 2
+        assert record["before"] == {"command": "start 0"}
+        assert record["command"] == "first"
+        assert record["resumed"] == [{"command": "second"}]
 
     def test_a_training_that_goes_on_keeps_the_record_of_its_beginning(
         self, files: list[Path], tmp_path: Path
