@@ -22,6 +22,11 @@ __all__ = ["add_arguments", "pretrain"]
 
 
 CHECKPOINT = "checkpoint.safetensors"
+OF_DRAWING = (
+    *("drawn_share", "drawn_perceptual_weight", "adversarial_weight", "adversary_rate"),
+    *("patches", "patch_px"),
+)
+"""Settings that nothing reads unless drawing is trained."""
 INTERRUPTED = (
     "pretraining was interrupted; finished scenes, and the last checkpoint of a restorer, are kept, and the "
     "same command goes on from them"
@@ -264,14 +269,20 @@ def _settings(given: argparse.Namespace) -> PretrainingConfig:
     """Settings of a restorer's training.
 
     Raises:
-        ConfigError: for an unknown setting, or a value out of its range.
+        ConfigError: for an unknown setting, a value out of its range, or one that would have no effect.
     """
     from extrags.restoration.diffusion.pretraining import PretrainingConfig
 
     names = ("scenes", "validation_scenes", "iterations", "batch", "learning_rate", "perceptual_weight")
     further = ("error_weight", "deterministic", "generative", "seed", "perceptual")
     given = argparse.Namespace(**vars(given), perceptual=not given.without_perceptual)
-    return training_settings(given, PretrainingConfig, (*names, *further), "extrags pretrain")
+    config = training_settings(given, PretrainingConfig, (*names, *further), "extrags pretrain")
+    unread = () if config.generative else OF_DRAWING
+    for name in sorted(config.model_fields_set.intersection(unread)):
+        raise ConfigError(f"setting {name}: nothing draws without --generative; leave it out")
+    if "perceptual_weight" in config.model_fields_set and not config.perceptual:
+        raise ConfigError("setting perceptual_weight: there is no such distance with --without-perceptual")
+    return config
 
 
 def check_enough(made: int, wanted: int, validation_scenes: int) -> None:
@@ -321,8 +332,8 @@ def checked(given: argparse.Namespace, scenes: int, validation_scenes: int, *, p
         perceptual: whether the perceptual distance is needed.
 
     Raises:
-        ConfigError: for settings that do not fit each other, a folder that cannot be written, or one that
-            holds another kind of weights.
+        ConfigError: for settings that do not fit each other, a folder that cannot be written, or one whose
+            weights would be lost.
         WeightsError: when the perceptual distance has no weights.
         SourceNotFoundError: when real textures are asked for and not on this machine.
     """
@@ -330,6 +341,8 @@ def checked(given: argparse.Namespace, scenes: int, validation_scenes: int, *, p
 
     if validation_scenes >= scenes and not given.scenes_only:
         raise ConfigError(f"{validation_scenes} of {scenes} scenes are for validation; none is left to train")
+    if "cavities" not in given.kinds and (given.real_textures or given.size_factor != 1):
+        raise ConfigError("--real-textures and --size-factor are for cavities, and --kinds names none")
     for name, least in (("workers", 1), ("threads", 1), ("size_factor", 1), ("first_scene", 0)):
         value = getattr(given, name)
         if value is not None and value < least:
@@ -339,7 +352,7 @@ def checked(given: argparse.Namespace, scenes: int, validation_scenes: int, *, p
     if given.output is None and not given.scenes_only:
         raise ConfigError("--output: where do the weights go? (--scenes-only makes scenes alone)")
     if given.output is not None and not (given.scenes_only or given.hidden_depth):
-        check_other_weights(Path(given.output), "refiner" if given.refiner else "embedded")
+        check_weights_there(Path(given.output), "refiner" if given.refiner else "embedded")
     if given.real_textures:
         from data_catalog.cavities.real_textures import texture_files
 
@@ -355,17 +368,20 @@ def checked(given: argparse.Namespace, scenes: int, validation_scenes: int, *, p
             raise ConfigError(f"{folder} cannot be written: {error.strerror or error}") from error
 
 
-def check_other_weights(folder: Path, backend: str) -> None:
-    """Refuse a folder whose weights would lose their description.
+def check_weights_there(folder: Path, backend: str) -> None:
+    """Refuse a folder whose weights would be lost.
 
-    Those of restorers and refiners have one name: the one that is written last is the only one.
+    The descriptions of restorers and refiners have one name: the one that is written last is the only one.
+    A restorer's training goes on in its folder from its checkpoint, which is gone once all steps are made:
+    who asks for more steps then would get weights that are trained anew.
 
     Args:
         folder: where weights go; need not be there.
         backend: what they are of, as their description says.
 
     Raises:
-        ConfigError: when the folder holds the description of another kind of weights.
+        ConfigError: when the folder holds the description of another kind of weights, or a restorer without a
+            checkpoint.
     """
     from extrags.restoration.description import DESCRIPTION, read_description
 
@@ -378,6 +394,11 @@ def check_other_weights(folder: Path, backend: str) -> None:
         raise ConfigError(
             f"--output {folder}: {DESCRIPTION} there describes other weights (backend {found}), and would be "
             f"overwritten by that of these ({backend}); take another folder"
+        )
+    if backend == "embedded" and not (folder / CHECKPOINT).is_file():
+        raise ConfigError(
+            f"--output {folder}: a finished restorer is there, and no checkpoint to go on from; take another "
+            f"folder, with --start {folder} to train it further, or remove {DESCRIPTION} to overwrite it"
         )
 
 

@@ -244,6 +244,51 @@ def test_any_setting_can_be_given_and_an_ended_training_goes_on(
     assert "most_seconds" in capsys.readouterr().err
 
 
+def test_finished_weights_are_not_overwritten(
+    scenes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Who gives more steps means to go on, and there is no checkpoint any more."""
+    given = ["pretrain", "--output", str(tmp_path / "w"), "--scenes-folder", str(scenes), "--scenes", "3"]
+    given += ["--validation-scenes", "1", "--batch", "1", "--without-perceptual", "--threads", "1"]
+    given += ["--set", "channels=8,16,16"]
+    assert main([*given, "--iterations", "1"]) == 0
+    before = (tmp_path / "w" / "restorer.json").read_bytes()
+    capsys.readouterr()
+    assert main([*given, "--iterations", "2"]) == 2
+    assert "a finished restorer is there, and no checkpoint to go on from" in capsys.readouterr().err
+    assert (tmp_path / "w" / "restorer.json").read_bytes() == before
+    # Scenes alone overwrite nothing.
+    assert main([*given, "--scenes-only"]) == 0
+    (tmp_path / "w" / "restorer.json").unlink()
+    assert main([*given, "--iterations", "2"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (["--set", "drawn_share=0.5"], "setting drawn_share: nothing draws without --generative"),
+        (["--set", "patch_px=32"], "setting patch_px: nothing draws without --generative"),
+        (["--perceptual-weight", "0.5"], "setting perceptual_weight: there is no such distance"),
+        (["--kinds", "phantom", "--size-factor", "2"], "--size-factor are for cavities"),
+    ],
+)
+def test_options_without_effect_are_refused(
+    options: list[str],
+    told: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def too_late(*_: object) -> None:
+        raise AssertionError("scenes were made")
+
+    monkeypatch.setattr("flows.commands.pretrain.make_scenes", too_late)
+    given = ["pretrain", "--output", str(tmp_path / "w"), "--scenes-folder", str(tmp_path / "s")]
+    assert main([*given, "--without-perceptual", *options]) == 2
+    assert told in capsys.readouterr().err
+    assert not (tmp_path / "s").exists()
+
+
 def test_what_would_fail_after_hours_is_said_at_once(
     scenes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
