@@ -51,7 +51,14 @@ def emit(event: Event) -> None:
 
 @contextmanager
 def subscribed(subscriber: Emit) -> Iterator[None]:
-    """Receive all events emitted inside the block, in this thread and in contexts copied from it."""
+    """Receive all events emitted inside the block, in this thread and in contexts copied from it.
+
+    A nested block takes the events inside it from the outer one, whose subscriber does not hear of them: an
+    inner subscriber that shall pass them on calls the outer one itself.
+
+    Args:
+        subscriber: called with each event, where it is emitted.
+    """
     token = _subscriber.set(subscriber)
     try:
         yield

@@ -20,7 +20,15 @@ from pydantic_core import PydanticKnownError
 from extrags.config.base import LARGEST_WHOLE_NUMBER, KeyOf, check_size, check_truth_value, has_largest
 from extrags.errors import ConfigError, did_you_mean
 
-__all__ = ["Setting", "groups_of", "listed_values", "parsed_words", "settings_of", "unknown_setting"]
+__all__ = [
+    "Setting",
+    "groups_of",
+    "listed_values",
+    "parsed_words",
+    "refused_settings",
+    "settings_of",
+    "unknown_setting",
+]
 
 
 @dataclass(frozen=True)
@@ -196,6 +204,33 @@ def unknown_setting(name: str, known: Iterable[str]) -> ConfigError:
     grouped = sorted(known, key=lambda other: "." not in other)
     groups = ", ".join(dict.fromkeys(other.partition(".")[0] for other in grouped))
     return ConfigError(f"no setting {name}{meant or f'; settings begin with {groups}'}")
+
+
+def refused_settings(
+    error: ValidationError, known: Mapping[str, Setting], given: Mapping[str, Any]
+) -> ConfigError:
+    """The error for settings that a model refuses, in the words of a single setting's.
+
+    Args:
+        error: of the model; the first thing that it says counts.
+        known: settings of the model, from `settings_of`.
+        given: values by dotted name, shown as they were given.
+    """
+    first = error.errors()[0]
+    # A place ends with the member of a union or of a tuple that was tried.
+    place = ".".join(str(part) for part in first["loc"])
+    wrong = next((name for name in known if f"{place}.".startswith(f"{name}.")), None)
+    if wrong is None:
+        # Several settings that do not go together; those of no group have no place.
+        reason = first["ctx"]["error"]
+        return ConfigError(f"{place}: {reason}" if place else str(reason))
+    # Not all values were given: what is wrong may have been there before (`with_seed` does not validate).
+    found = repr(given.get(wrong, first["input"]))
+    reason = first.get("ctx", {}).get("error")
+    # What `KeyOf` says of a name that is none, `refused` says as well, with its suggestion.
+    if isinstance(reason, ValueError) and not isinstance(reason, ConfigError):
+        return ConfigError(f"setting {wrong} is {found}; {reason}")
+    return known[wrong].refused(found)
 
 
 def _models(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, type[BaseModel]]]:

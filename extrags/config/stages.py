@@ -23,7 +23,7 @@ from extrags.config.finetuning import FinetuneConfig
 from extrags.config.imported import ImportedConfig
 from extrags.config.poses import PosesConfig
 from extrags.config.restorer import EnhanceConfig
-from extrags.config.settings import settings_of, unknown_setting
+from extrags.config.settings import refused_settings, settings_of, unknown_setting
 from extrags.errors import ConfigError, PoseError
 from extrags.provenance import StereoCamera
 from extrags.thresholds import HOLE_ALPHA
@@ -366,17 +366,4 @@ class PipelineConfig(StageConfig):
         try:
             return PipelineConfig.model_validate(tree)
         except ValidationError as error:
-            first = error.errors()[0]
-            # A place ends with the member of a union or of a tuple that was tried.
-            place = ".".join(str(part) for part in first["loc"])
-            wrong = next((name for name in known if f"{place}.".startswith(f"{name}.")), None)
-            if wrong is None:
-                # Several settings that do not go together.
-                raise ConfigError(f"{place}: {first['ctx']['error']}") from error
-            # `with_seed` does not validate: what is wrong may have been there before.
-            found = repr(overrides.get(wrong, first["input"]))
-            reason = first.get("ctx", {}).get("error")
-            # What `KeyOf` says of a name that is none, `refused` says as well, with its suggestion.
-            if isinstance(reason, ValueError) and not isinstance(reason, ConfigError):
-                raise ConfigError(f"setting {wrong} is {found}; {reason}") from error
-            raise known[wrong].refused(found) from error
+            raise refused_settings(error, known, overrides) from error

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from extrags.errors import WeightsError
+from extrags.output_files import write_file
 
 __all__ = [
     "DESCRIPTION",
@@ -23,14 +24,14 @@ DESCRIPTION = "restorer.json"
 
 
 def write_description(folder: Path, description: Mapping[str, Any]) -> None:
-    """Write `restorer.json` into a folder, which is made if needed.
+    """Write `restorer.json` into a folder, which is made if needed; it is there whole, or as it was before.
 
     Args:
         folder: of the saved restorer.
         description: ready for JSON; its entry `backend` names the backend that reads the folder again.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / DESCRIPTION).write_text(json.dumps(description, indent=2, allow_nan=False) + "\n")
+    write_file(folder / DESCRIPTION, json.dumps(description, indent=2, allow_nan=False) + "\n")
 
 
 def read_description(file: Path) -> dict[str, Any]:

@@ -323,9 +323,13 @@ def training_settings(
     Raises:
         ConfigError: for an unknown setting, or a value out of its range.
     """
+    from pydantic import ValidationError
+
+    from extrags.config.settings import refused_settings, settings_of
+
     values = {name: getattr(given, name) for name in names if getattr(given, name) is not None}
     values |= further_settings(given.set, model)
     try:
         return model(**values)
-    except ValueError as error:
-        raise ConfigError(f"{command}: {error}") from error
+    except ValidationError as error:
+        raise ConfigError(f"{command}: {refused_settings(error, settings_of(model), values)}") from error

@@ -5,11 +5,10 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from extrags.errors import ConfigError
+from extrags.errors import CaptureError, ConfigError, WeightsError
 from flows.commands.common import set_up_logging, showing, training_settings
 from flows.commands.options import Parser, add_output
 from flows.commands.outputs import output_folder
@@ -23,6 +22,11 @@ __all__ = ["add_arguments", "pretrain"]
 
 
 CHECKPOINT = "checkpoint.safetensors"
+OF_DRAWING = (
+    *("drawn_share", "drawn_perceptual_weight", "adversarial_weight", "adversary_rate"),
+    *("patches", "patch_px"),
+)
+"""Settings that nothing reads unless drawing is trained."""
 INTERRUPTED = (
     "pretraining was interrupted; finished scenes, and the last checkpoint of a restorer, are kept, and the "
     "same command goes on from them"
@@ -191,7 +195,7 @@ def pretrain(given: argparse.Namespace) -> int:
 
     from extrags.raster.bench import machine
     from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
-    from extrags.restoration.diffusion.pretraining import PretrainingConfig, check_settings
+    from extrags.restoration.diffusion.pretraining import PretrainingConfig, check_settings, check_sizes
     from extrags.restoration.diffusion.pretraining import pretrain as trained
     from extrags.restoration.diffusion.weights import COLONS, starting_weights
     from extrags.restoration.hidden_depth.training import HiddenDepthConfig
@@ -218,6 +222,7 @@ def pretrain(given: argparse.Namespace) -> int:
     )
     checked(given, config.scenes, config.validation_scenes, perceptual=perceptual)
     start = None
+    sources = scene_sources(given, config.scenes)
     if isinstance(config, HiddenDepthConfig):
         begun = beginning(given.start or COLONS, config.completion)
     elif isinstance(config, RefinerConfig):
@@ -227,9 +232,11 @@ def pretrain(given: argparse.Namespace) -> int:
             start = EmbeddedEnhancer.load(starting_weights(given.start)).without_scene()
         if not given.scenes_only:
             check_settings(config, start)
+            # Those that validate may be of any size.
+            trained_on = (source.config for source in sources[: -config.validation_scenes])
+            check_sizes(config, [(scene.height, scene.width) for scene in trained_on])
     # As things are now: in some hours the working tree may be another.
     about: dict[str, Any] = {"command": _command(given), "machine": machine()}
-    sources = scene_sources(given, config.scenes)
     with progress_display(showing(given)), reporting("restorer", "pretrain"):
         folder = Path(given.scenes_folder)
         if isinstance(config, HiddenDepthConfig):
@@ -237,6 +244,7 @@ def pretrain(given: argparse.Namespace) -> int:
             folder = folder / FOLDER
         else:
             files = make_scenes(folder, sources, given.workers)
+            check_enough(len(files), config.scenes, 0 if given.scenes_only else config.validation_scenes)
         if given.scenes_only:
             console().print(f"{len(files)} scenes in {folder}", markup=False)
             return 0
@@ -249,8 +257,9 @@ def pretrain(given: argparse.Namespace) -> int:
             refiner.save(Path(given.output))
             return _told(refiner.record, given.output)
         checkpoint = Path(given.output) / CHECKPOINT
-        enhancer = trained(files, config, start, checkpoint=checkpoint)
-        replace(enhancer, record={**enhancer.record, **about}).save(Path(given.output), half=True)
+        config = for_scenes(config, len(files))
+        enhancer = trained(files, config, start, checkpoint=checkpoint, about=about)
+        enhancer.save(Path(given.output), half=True)
         if enhancer.record["iterations_made"] >= config.iterations:
             checkpoint.unlink()
     return _told(enhancer.record, given.output)
@@ -260,14 +269,47 @@ def _settings(given: argparse.Namespace) -> PretrainingConfig:
     """Settings of a restorer's training.
 
     Raises:
-        ConfigError: for an unknown setting, or a value out of its range.
+        ConfigError: for an unknown setting, a value out of its range, or one that would have no effect.
     """
     from extrags.restoration.diffusion.pretraining import PretrainingConfig
 
     names = ("scenes", "validation_scenes", "iterations", "batch", "learning_rate", "perceptual_weight")
     further = ("error_weight", "deterministic", "generative", "seed", "perceptual")
     given = argparse.Namespace(**vars(given), perceptual=not given.without_perceptual)
-    return training_settings(given, PretrainingConfig, (*names, *further), "extrags pretrain")
+    config = training_settings(given, PretrainingConfig, (*names, *further), "extrags pretrain")
+    unread = () if config.generative else OF_DRAWING
+    for name in sorted(config.model_fields_set.intersection(unread)):
+        raise ConfigError(f"setting {name}: nothing draws without --generative; leave it out")
+    if "perceptual_weight" in config.model_fields_set and not config.perceptual:
+        raise ConfigError("setting perceptual_weight: there is no such distance with --without-perceptual")
+    return config
+
+
+def check_enough(made: int, wanted: int, validation_scenes: int) -> None:
+    """Refuse to go on where too few scenes could be made.
+
+    Args:
+        made: scenes that there are.
+        wanted: scenes asked for.
+        validation_scenes: how many of them validate only.
+
+    Raises:
+        CaptureError: when no scene is left beside those.
+    """
+    if made <= validation_scenes:
+        validate = f", and {validation_scenes} are for validation" if validation_scenes else ""
+        raise CaptureError(
+            f"{made} of {wanted} scenes could be made{validate}; none is left. More --scenes, or others "
+            "(--first-scene), may give some"
+        )
+
+
+def for_scenes(config: PretrainingConfig, made: int) -> PretrainingConfig:
+    """The settings for those scenes that could be made, with one drawing process for each at most."""
+    most = made - config.validation_scenes
+    return config.model_copy(
+        update={"scenes": made, "drawing_processes": min(config.drawing_processes, most)}
+    )
 
 
 def _told(record: dict[str, Any], folder: str) -> int:
@@ -290,14 +332,17 @@ def checked(given: argparse.Namespace, scenes: int, validation_scenes: int, *, p
         perceptual: whether the perceptual distance is needed.
 
     Raises:
-        ConfigError: for settings that do not fit each other, or a folder that cannot be written.
+        ConfigError: for settings that do not fit each other, a folder that cannot be written, or one whose
+            weights would be lost.
         WeightsError: when the perceptual distance has no weights.
         SourceNotFoundError: when real textures are asked for and not on this machine.
     """
     from extrags.metrics.lpips_weights import find_weights
 
-    if validation_scenes >= scenes:
+    if validation_scenes >= scenes and not given.scenes_only:
         raise ConfigError(f"{validation_scenes} of {scenes} scenes are for validation; none is left to train")
+    if "cavities" not in given.kinds and (given.real_textures or given.size_factor != 1):
+        raise ConfigError("--real-textures and --size-factor are for cavities, and --kinds names none")
     for name, least in (("workers", 1), ("threads", 1), ("size_factor", 1), ("first_scene", 0)):
         value = getattr(given, name)
         if value is not None and value < least:
@@ -306,6 +351,8 @@ def checked(given: argparse.Namespace, scenes: int, validation_scenes: int, *, p
         raise ConfigError(f"--exact-share {given.exact_share}: expected a number from 0 to 1")
     if given.output is None and not given.scenes_only:
         raise ConfigError("--output: where do the weights go? (--scenes-only makes scenes alone)")
+    if given.output is not None and not (given.scenes_only or given.hidden_depth):
+        check_weights_there(Path(given.output), "refiner" if given.refiner else "embedded")
     if given.real_textures:
         from data_catalog.cavities.real_textures import texture_files
 
@@ -319,6 +366,40 @@ def checked(given: argparse.Namespace, scenes: int, validation_scenes: int, *, p
             Path(folder).mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise ConfigError(f"{folder} cannot be written: {error.strerror or error}") from error
+
+
+def check_weights_there(folder: Path, backend: str) -> None:
+    """Refuse a folder whose weights would be lost.
+
+    The descriptions of restorers and refiners have one name: the one that is written last is the only one.
+    A restorer's training goes on in its folder from its checkpoint, which is gone once all steps are made:
+    who asks for more steps then would get weights that are trained anew.
+
+    Args:
+        folder: where weights go; need not be there.
+        backend: what they are of, as their description says.
+
+    Raises:
+        ConfigError: when the folder holds the description of another kind of weights, or a restorer without a
+            checkpoint.
+    """
+    from extrags.restoration.description import DESCRIPTION, read_description
+
+    try:
+        found = read_description(folder / DESCRIPTION).get("backend")
+    except WeightsError:
+        # None there, or one that nothing can read: no weights would be lost.
+        return
+    if found != backend:
+        raise ConfigError(
+            f"--output {folder}: {DESCRIPTION} there describes other weights (backend {found}), and would be "
+            f"overwritten by that of these ({backend}); take another folder"
+        )
+    if backend == "embedded" and not (folder / CHECKPOINT).is_file():
+        raise ConfigError(
+            f"--output {folder}: a finished restorer is there, and no checkpoint to go on from; take another "
+            f"folder, with --start {folder} to train it further, or remove {DESCRIPTION} to overwrite it"
+        )
 
 
 def _command(given: argparse.Namespace) -> str:

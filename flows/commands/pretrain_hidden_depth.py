@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from extrags.errors import CaptureError, ConfigError, DivergedError, ExtragsError
-from flows.commands.common import training_settings
+from flows.commands.common import training_settings, write_json
 from flows.commands.pretrain_scenes import in_processes
 
 if TYPE_CHECKING:
@@ -182,16 +182,16 @@ def trained_reader(
         The record.
 
     Raises:
+        StoreError: when the record cannot be written.
         ExtragsError: as `train_hidden_depth`.
     """
-    from safetensors.torch import save_file
-
+    from extrags.array_files import save_safetensors
     from extrags.depth.weights import HIDDEN
     from extrags.restoration.hidden_depth.training import train_hidden_depth
 
     network, record = train_hidden_depth(files, config, begun.network)
     record |= {"restorer": begun.restorer_digest, "completion": begun.network_digest, **about}
-    weights = {name: value.half().contiguous() for name, value in network.state_dict().items()}
-    save_file(weights, out / f"{HIDDEN}.safetensors")
-    (out / f"{HIDDEN}.json").write_text(json.dumps(record, indent=1) + "\n")
+    weights = {name: value.half() for name, value in network.state_dict().items()}
+    save_safetensors(out / f"{HIDDEN}.safetensors", weights)
+    write_json(record, str(out / f"{HIDDEN}.json"))
     return record

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
+
+from extrags.errors import CaptureError, DivergedError
 
 if TYPE_CHECKING:
     from data_catalog.cavities.pretraining import CavityConfig
@@ -17,6 +20,10 @@ if TYPE_CHECKING:
     from extrags.restoration.training_data.recordings import PretrainingRecording
 
 __all__ = ["SOURCES", "SceneSource", "in_processes", "make_scene", "make_scenes", "scene_sources"]
+
+Result = TypeVar("Result")
+
+logger = logging.getLogger(__name__)
 
 SOURCES = ("phantom", "cavities")
 """Families of pretraining scenes."""
@@ -131,6 +138,9 @@ def make_scenes(folder: Path, sources: Sequence[SceneSource], workers: int) -> l
         folder: where they are kept.
         sources: which scenes.
         workers: processes at once.
+
+    Returns:
+        Files of the scenes that could be made; a warning names each of the others.
     """
     from extrags.restoration.training_data.pretraining_scenes import PretrainingScene
 
@@ -141,27 +151,45 @@ def make_scenes(folder: Path, sources: Sequence[SceneSource], workers: int) -> l
         if PretrainingScene.made_from(file) != source.origin
     ]
     jobs = [partial(make_scene, source, file) for source, file in missing]
-    in_processes(jobs, workers, "pretraining-scenes", done=len(files) - len(missing))
-    return files
+    reasons = in_processes(jobs, workers, "pretraining-scenes", done=len(files) - len(missing))
+    failed = {file: reason for (_, file), reason in zip(missing, reasons, strict=True) if reason is not None}
+    for file, reason in failed.items():
+        # Told here: what a process of its own logs goes past the progress bar.
+        logger.warning("%s: left out, %s", file.stem, reason)
+    return [file for file in files if file not in failed]
 
 
-def make_scene(source: SceneSource, file: Path) -> None:
-    """One pretraining scene."""
+def make_scene(source: SceneSource, file: Path) -> str | None:
+    """One pretraining scene.
+
+    Args:
+        source: of the scene.
+        file: where it goes.
+
+    Returns:
+        Why there is none, where it cannot be recorded or reconstructed; else None.
+    """
     from extrags.config import profile_config
     from extrags.restoration.training_data.pretraining_scenes import make_pretraining_scene
 
     quick = profile_config("quick")
-    scene = make_pretraining_scene(
-        source.recording(),
-        quick,
-        source.seed,
-        explored=source.explored,
-        exact_share=source.exact_share,
-    )
+    try:
+        scene = make_pretraining_scene(
+            source.recording(),
+            quick,
+            source.seed,
+            explored=source.explored,
+            exact_share=source.exact_share,
+        )
+    except (CaptureError, DivergedError) as error:
+        return str(error)
     scene.save(file, origin=source.origin)
+    return None
 
 
-def in_processes(jobs: Sequence[Callable[[], None]], workers: int, told_as: str, *, done: int = 0) -> None:
+def in_processes(
+    jobs: Sequence[Callable[[], Result]], workers: int, told_as: str, *, done: int = 0
+) -> list[Result]:
     """Run jobs on one thread each, and tell the progress.
 
     Args:
@@ -169,6 +197,9 @@ def in_processes(jobs: Sequence[Callable[[], None]], workers: int, told_as: str,
         workers: processes at once.
         told_as: named in progress events.
         done: how many more there were, which are done already.
+
+    Returns:
+        What each job gave, in their order.
     """
     import multiprocessing
 
@@ -187,9 +218,10 @@ def in_processes(jobs: Sequence[Callable[[], None]], workers: int, told_as: str,
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
+    return [future.result() for future in running]
 
 
-def _on_one_thread(job: Callable[[], None]) -> None:
+def _on_one_thread(job: Callable[[], Result]) -> Result:
     """The same bits on every machine with the same instructions."""
     import cv2
     import torch
@@ -199,4 +231,4 @@ def _on_one_thread(job: Callable[[], None]) -> None:
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     set_num_threads(1)
-    job()
+    return job()

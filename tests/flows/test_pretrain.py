@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from argparse import Namespace
 from dataclasses import replace
 from importlib.resources import files
@@ -13,11 +14,12 @@ import torch
 from extrags.array_files import load_safetensors
 from extrags.cameras import Cameras
 from extrags.depth.completion import CompletionNetwork
-from extrags.errors import CaptureError
+from extrags.errors import CaptureError, DivergedError
 from extrags.events import Progress, subscribed
 from extrags.metrics.lpips import Lpips
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.diffusion.network import build_network
+from extrags.restoration.diffusion.pretraining import PretrainingConfig, check_settings, check_sizes
 from extrags.restoration.hidden_depth.examples import HiddenDepthExamples
 from extrags.restoration.refinement.refiner import Refiner
 from extrags.restoration.surface_texture import SurfaceTexture
@@ -28,6 +30,8 @@ from extrags.view_synthesis.gamut import Gamut
 from extrags.view_synthesis.references import LightTransfer
 from flows.cli import main
 from flows.commands import pretrain_scenes
+from flows.commands.options import Parser
+from flows.commands.pretrain import _settings, add_arguments, for_scenes
 from flows.commands.pretrain_refiner import examples_of, start_of_refiner
 from flows.commands.pretrain_scenes import SceneSource, make_scenes, scene_sources
 from tests.extrags.random_lpips import random_weights
@@ -115,10 +119,62 @@ def test_families_take_turns_and_do_not_share_numbers() -> None:
 
 
 def test_scenes_alone_train_nothing(scenes: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    given = ["pretrain", "--scenes-only", "--scenes-folder", str(scenes), "--scenes", "3"]
-    assert main([*given, "--validation-scenes", "1"]) == 0
+    # Fewer than would validate by default.
+    assert main(["pretrain", "--scenes-only", "--scenes-folder", str(scenes), "--scenes", "3"]) == 0
     assert "3 scenes in" in capsys.readouterr().out
     assert len(list(scenes.iterdir())) == 3
+
+
+class TestScenesThatCannotBeMade:
+    @pytest.fixture(autouse=True)
+    def poor(self, scenes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        """The second of three scenes has yet to be made, and its reconstruction diverges."""
+        (scenes / sources()[1].file_name).unlink()
+
+        def diverged(*_given: object, **_named: object) -> PretrainingScene:
+            raise DivergedError("pretraining-scene: the loss is not finite at iteration 3")
+
+        monkeypatch.setattr(pretrain_scenes, "ProcessPoolExecutor", _Here)
+        monkeypatch.setattr(pretrain_scenes, "_on_one_thread", lambda job: job())
+        monkeypatch.setattr(SceneSource, "recording", lambda source: None)
+        module = "extrags.restoration.training_data.pretraining_scenes.make_pretraining_scene"
+        monkeypatch.setattr(module, diverged)
+
+    def test_they_are_left_out(
+        self,
+        scenes: Path,
+        tmp_path: Path,
+        capsys: pytest.CaptureFixture[str],
+        caplog: pytest.LogCaptureFixture,
+    ) -> None:
+        common = ["pretrain", "--scenes-folder", str(scenes), "--scenes", "3", "--validation-scenes", "1"]
+        assert main([*common, "--scenes-only"]) == 0
+        assert "2 scenes in" in capsys.readouterr().out
+        assert "cavities_00000: left out, pretraining-scene: the loss is not finite" in caplog.text
+        given = ["--iterations", "1", "--batch", "1", "--without-perceptual", "--threads", "1"]
+        given += ["--set", "channels=8,16,16", "--output", str(tmp_path / "w")]
+        assert main([*common, *given]) == 0
+        record = json.loads((tmp_path / "w" / "restorer.json").read_text())["record"]
+        assert record["pretraining"]["scenes"] == 2
+
+    def test_too_few_others_are_told(
+        self, scenes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        common = ["pretrain", "--scenes-folder", str(scenes), "--without-perceptual"]
+        given = ["--output", str(tmp_path / "w"), "--scenes", "3", "--validation-scenes", "2"]
+        assert main([*common, *given]) != 0
+        assert (
+            "2 of 3 scenes could be made, and 2 are for validation; none is left" in capsys.readouterr().err
+        )
+        only = ["--scenes-only", "--kinds", "cavities", "--first-scene", "7", "--scenes", "2"]
+        assert main([*common, *only]) != 0
+        assert "0 of 2 scenes could be made; none is left" in capsys.readouterr().err
+
+    def test_processes_are_as_many_as_the_scenes_at_most(self) -> None:
+        config = PretrainingConfig(scenes=9, validation_scenes=2, drawing_processes=7)
+        fewer = for_scenes(config, 5)
+        assert (fewer.scenes, fewer.drawing_processes) == (5, 3)
+        assert for_scenes(config, 9) == config
 
 
 class _Here:
@@ -174,10 +230,63 @@ def test_any_setting_can_be_given_and_an_ended_training_goes_on(
         assert record["iterations_made"] == made
     assert (tmp_path / "w" / "checkpoint.safetensors").exists()
     assert "--set channels=8,16,16" in record["command"]
+    # The command of the beginning, and those that went on.
+    assert main([*given, "--iterations", "700"]) == 0
+    record = json.loads((tmp_path / "w" / "restorer.json").read_text())["record"]
+    assert "--iterations" not in record["command"]
+    first, second = record["resumed"]
+    assert "--iterations" not in first["command"]
+    assert "--iterations 700" in second["command"]
+    assert second["machine"] == record["machine"]
     assert main([*given, "--set", "drawn=1"]) == 2
     assert "drawn_share" in capsys.readouterr().err
     assert main([*given, "--set", "most_seconds=-1"]) == 2
     assert "most_seconds" in capsys.readouterr().err
+
+
+def test_finished_weights_are_not_overwritten(
+    scenes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Who gives more steps means to go on, and there is no checkpoint any more."""
+    given = ["pretrain", "--output", str(tmp_path / "w"), "--scenes-folder", str(scenes), "--scenes", "3"]
+    given += ["--validation-scenes", "1", "--batch", "1", "--without-perceptual", "--threads", "1"]
+    given += ["--set", "channels=8,16,16"]
+    assert main([*given, "--iterations", "1"]) == 0
+    before = (tmp_path / "w" / "restorer.json").read_bytes()
+    capsys.readouterr()
+    assert main([*given, "--iterations", "2"]) == 2
+    assert "a finished restorer is there, and no checkpoint to go on from" in capsys.readouterr().err
+    assert (tmp_path / "w" / "restorer.json").read_bytes() == before
+    # Scenes alone overwrite nothing.
+    assert main([*given, "--scenes-only"]) == 0
+    (tmp_path / "w" / "restorer.json").unlink()
+    assert main([*given, "--iterations", "2"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (["--set", "drawn_share=0.5"], "setting drawn_share: nothing draws without --generative"),
+        (["--set", "patch_px=32"], "setting patch_px: nothing draws without --generative"),
+        (["--perceptual-weight", "0.5"], "setting perceptual_weight: there is no such distance"),
+        (["--kinds", "phantom", "--size-factor", "2"], "--size-factor are for cavities"),
+    ],
+)
+def test_options_without_effect_are_refused(
+    options: list[str],
+    told: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def too_late(*_: object) -> None:
+        raise AssertionError("scenes were made")
+
+    monkeypatch.setattr("flows.commands.pretrain.make_scenes", too_late)
+    given = ["pretrain", "--output", str(tmp_path / "w"), "--scenes-folder", str(tmp_path / "s")]
+    assert main([*given, "--without-perceptual", *options]) == 2
+    assert told in capsys.readouterr().err
+    assert not (tmp_path / "s").exists()
 
 
 def test_what_would_fail_after_hours_is_said_at_once(
@@ -190,6 +299,13 @@ def test_what_would_fail_after_hours_is_said_at_once(
     assert "--output" in capsys.readouterr().err
     assert main(["pretrain", *out, "--workers", "0"]) == 2
     assert "--workers 0" in capsys.readouterr().err
+    refused = "extrags pretrain: setting learning_rate is -1.0; expected a number above 0\n"
+    assert main(["pretrain", *out, "--learning-rate", "-1"]) == 2
+    assert capsys.readouterr().err.endswith(refused)
+    assert main(["pretrain", *out, "--generative", "--without-perceptual"]) == 2
+    told = capsys.readouterr().err
+    assert "extrags pretrain: generative needs the perceptual distance" in told
+    assert "validation error" not in told
     (tmp_path / "file").write_text("")
     assert main(["pretrain", "--output", str(tmp_path / "file" / "w"), "--without-perceptual"]) == 2
     assert "cannot be written" in capsys.readouterr().err
@@ -206,11 +322,30 @@ def test_settings_that_do_not_fit_are_told_before_a_scene_is_made(
     given += ["--scenes", "3", "--validation-scenes", "1", "--without-perceptual"]
     assert main([*given, "--set", "drawing_processes=3"]) == 2
     assert "there are 2 scenes to train on" in capsys.readouterr().err
+    # Phantoms of 176 x 112 px are among them.
+    assert main([*given, "--scenes", "30", "--set", "crop=128"]) == 2
+    assert "crop=128: images of some scenes (176x112 px) are too small for it" in capsys.readouterr().err
     network = build_network(CONDITION_CHANNELS, (8, 16, 16), torch.Generator().manual_seed(1))
     start = EmbeddedEnhancer(network, 1, 1, 0, False, Gamut(0.0, 1e6, 0.0, 1e6), {})
     start.save(tmp_path / "start")
     assert main([*given, "--start", str(tmp_path / "start")]) == 2
     assert "the weights to start from have channels (8, 16, 16)" in capsys.readouterr().err
+
+
+def test_documented_trainings_fit_their_scenes() -> None:
+    document = Path(__file__).parents[2] / "docs" / "restorer_weights.md"
+    lines = [line for line in document.read_text().splitlines() if line.startswith("extrags pretrain ")]
+    others = ("--refiner", "--hidden-depth", "--scenes-only")
+    commands = [line for line in lines if not any(option in line for option in others)]
+    assert any("--generative" in command for command in commands)
+    for command in commands:
+        parser = Parser()
+        add_arguments(parser)
+        given = parser.parse_args(shlex.split(command)[2:])
+        config = _settings(given)
+        scenes = [source.config for source in scene_sources(given, config.scenes)]
+        check_settings(config.model_copy(update={"device": "cpu"}), None)
+        check_sizes(config, [(scene.height, scene.width) for scene in scenes])
 
 
 def test_the_weights_of_the_package_say_where_they_come_from() -> None:
@@ -273,6 +408,26 @@ class TestRefiner:
         before = [file.stat().st_mtime_ns for file in kept]
         assert main([*given, "--output", str(tmp_path / "again")]) == 0
         assert [file.stat().st_mtime_ns for file in kept] == before
+
+    def test_weights_of_another_kind_are_not_overwritten(
+        self, given: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        """Restorers and refiners have descriptions of one name."""
+        refiner, restorer = tmp_path / "refiner", tmp_path / "restorer"
+        plain = [item for item in given if item not in ("--refiner", "--set", "crop=64")]
+        plain += ["--without-perceptual", "--set", "channels=8,16,16"]
+        assert main([*given, "--output", str(refiner)]) == 0
+        assert main([*plain, "--output", str(restorer)]) == 0
+        capsys.readouterr()
+        for arguments, folder in (plain, refiner), (given, restorer):
+            before = (folder / "restorer.json").read_bytes()
+            assert main([*arguments, "--output", str(folder)]) == 2
+            assert f"--output {folder}: restorer.json there" in capsys.readouterr().err
+            assert (folder / "restorer.json").read_bytes() == before
+        assert Refiner.load(refiner).record["iterations_made"] == 2
+        assert EmbeddedEnhancer.load(restorer).record["iterations_made"] == 2
+        # Its own kind may be trained anew.
+        assert main([*given, "--output", str(refiner)]) == 0
 
     def test_a_scene_without_texture_is_done_too(self, tmp_path: Path) -> None:
         file = tmp_path / "scene.safetensors"
@@ -357,6 +512,8 @@ class TestHiddenDepth:
         assert len(record["restorer"]) == len(record["completion"]) == 32
         weights = load_safetensors(out / "hidden.safetensors")
         CompletionNetwork().load_state_dict({name: value.float() for name, value in weights.items()})
+        # Whoever may read the record may read the weights.
+        assert (out / "hidden.safetensors").stat().st_mode == (out / "hidden.json").stat().st_mode
         # What could be explored is kept.
         assert main([*given, "--output", str(tmp_path / "again")]) == 0
         assert made[3:] == ["cavities 0"]

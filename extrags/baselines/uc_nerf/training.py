@@ -59,6 +59,9 @@ and of neighbours, which it is the largest of."""
 _OCCLUSION_CELL_PX = 8
 _OCCLUSION_MARGIN = 1.1
 _MIN_SPARSE = 4
+"""A frame with fewer pixels of known depth counts as one without any."""
+_MOST_NAMED = 3
+"""Frames that a warning names."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +75,9 @@ class SparseDepth:
 
     pixels: Float[np.ndarray, "k 2"]
     z: Float[np.ndarray, "k"]
+
+
+NO_DEPTH = SparseDepth(np.zeros((0, 2)), np.zeros(0))
 
 
 @dataclass(frozen=True)
@@ -102,7 +108,7 @@ def train(
 
     Raises:
         CaptureError: with fewer than three training frames; when neither depth nor points are known and all
-            cameras stand in one place.
+            cameras stand in one place; as `sparse_depths`.
         ConfigError: for frames through a lens: the baseline renders pinholes.
         DivergedError: when the loss does not stay finite.
 
@@ -302,7 +308,8 @@ def sparse_depths(
     The sparse points of the source where it has some; else its depth at the strongest corners of the image.
     Nothing between these pixels is used. Where neither is known, or not enough, no pixel has a depth, which a
     warning says: agreement of colours is then all that supervises, between depths that follow from the
-    cameras (`extrags.training.random_start.depth_range`).
+    cameras (`extrags.training.random_start.depth_range`). So are single frames of which too few pixels have
+    one, between the depths of the others.
 
     Args:
         sequence: posed frames.
@@ -310,7 +317,7 @@ def sparse_depths(
         per_frame: corners of a frame at most.
 
     Raises:
-        CaptureError: when too few pixels of a frame have a depth, though others have enough.
+        CaptureError: when there are points, or depth of some frame, and no frame has it at enough pixels.
     """
     if sequence.points is not None and len(sequence.points) >= _MIN_SPARSE:
         found = [_visible_points(sequence, int(frame), sequence.points) for frame in frames]
@@ -320,14 +327,22 @@ def sparse_depths(
         _log.warning(
             "%s: neither depth nor enough sparse points are known; colours alone supervise", sequence.name
         )
-        return [SparseDepth(np.zeros((0, 2)), np.zeros(0)) for _ in frames]
-    for item, frame in zip(found, frames, strict=True):
-        if len(item.z) < _MIN_SPARSE:
-            raise CaptureError(
-                f"{sequence.name}: frame {sequence.frame_name(int(frame))} has {len(item.z)} pixels of known "
-                f"depth, expected at least {_MIN_SPARSE}"
-            )
-    return found
+        return [NO_DEPTH] * len(frames)
+    few = [place for place, item in enumerate(found) if len(item.z) < _MIN_SPARSE]
+    if len(few) == len(found):
+        raise CaptureError(
+            f"{sequence.name}: none of {len(found)} training frames has {_MIN_SPARSE} pixels of known depth "
+            "or more, at corners of the image or sparse points"
+        )
+    if few:
+        named = ", ".join(sequence.frame_name(int(frames[place])) for place in few[:_MOST_NAMED])
+        more = f" and {len(few) - _MOST_NAMED} more" if len(few) > _MOST_NAMED else ""
+        _log.warning(
+            "%s: fewer than %d pixels of known depth in %d of %d training frames (%s%s); colours alone "
+            "supervise there",
+            *(sequence.name, _MIN_SPARSE, len(few), len(found), named, more),
+        )
+    return [NO_DEPTH if place in few else item for place, item in enumerate(found)]
 
 
 def photometric_consistency(

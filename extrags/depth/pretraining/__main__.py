@@ -25,6 +25,7 @@ from extrags.depth.pretraining.training import (
     train_completion,
     unmatched,
 )
+from extrags.output_files import write_file
 
 log = logging.getLogger("extrags.depth.pretraining")
 
@@ -132,7 +133,7 @@ def main() -> None:
         "scores_before": before,
         "scores": scores,
     }
-    (options.folder / "completion.json").write_text(json.dumps(record, indent=1))
+    write_file(options.folder / "completion.json", json.dumps(record, indent=1) + "\n")
 
 
 def _scores(network: CompletionNetwork, held_out: ExampleBank) -> dict[str, dict[str, float]]:

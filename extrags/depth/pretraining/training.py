@@ -142,7 +142,7 @@ def train_completion(
         loss: terms of the loss, from the channels and what `completion_loss` is given, which is the default.
 
     Raises:
-        DivergedError: when the loss stops being finite.
+        DivergedError: when the loss stops being finite, or a weight is not finite at the end.
     """
     device = bank.all_of_size()[0].truth.device
     network = CompletionNetwork() if network is None else network
@@ -186,6 +186,10 @@ def train_completion(
             sums = {}
             if told is not None:
                 told(iteration + 1, means)
+    # The loss was looked at every hundred iterations, and not at all of what the last one made.
+    for name, value in average.state_dict().items():
+        if not bool(torch.isfinite(value).all()):
+            raise DivergedError(f"pretraining of the depth completion: {name} is not finite at the end")
     return average
 
 

@@ -156,10 +156,28 @@ class NetworkTraining:
         return found
 
     def finished(self) -> RestorationNetwork:
-        """The network with the running mean of its weights, ready for use."""
+        """The network with the running mean of its weights, ready for use.
+
+        Raises:
+            DivergedError: when a weight is not finite.
+        """
+        self.check_finite()
         self.network.load_state_dict(self.mean)
         self.network.eval()
         return self.network
+
+    def check_finite(self) -> None:
+        """Look at the weights: the loss is that before a step, and says nothing of what the last one made.
+
+        Raises:
+            DivergedError: when a weight, or its running mean, is not finite.
+        """
+        for name, value in (*self.network.state_dict().items(), *self.mean.items()):
+            if not bool(torch.isfinite(value).all()):
+                raise DivergedError(
+                    f"{self.stage}: the restorer's weights are not finite after iteration {self.iteration} "
+                    f"(parameter group: network, {name})"
+                )
 
     def state(self) -> dict[str, Tensor]:
         """Everything that goes on with `restore`, as tensors on the processor."""
@@ -300,7 +318,7 @@ def train_network(
         stage: named in progress events.
 
     Raises:
-        DivergedError: when the loss stops being finite.
+        DivergedError: when the loss or a weight stops being finite.
     """
     training = NetworkTraining(network, settings, generator, stage=stage)
     for _ in range(settings.iterations):

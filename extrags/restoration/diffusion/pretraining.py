@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import copy
+import hashlib
 import json
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from pydantic import Field, model_validator
 from torch import Tensor
 
@@ -33,6 +34,7 @@ from extrags.restoration.diffusion.network_training import NetworkTraining, Trai
 from extrags.restoration.diffusion.precision import has_fast_half_precision
 from extrags.restoration.diffusion.validation import validation_scores
 from extrags.restoration.training_data.augmentation import (
+    PATCH_SIDE_MULTIPLE,
     Batch,
     CropSampler,
     MixedSampler,
@@ -44,7 +46,7 @@ from extrags.restoration.uncertainty.domain import Domain
 from extrags.view_synthesis.conditioning import CONDITION_CHANNELS, INVENTED_CHANNELS, Layers
 from extrags.view_synthesis.gamut import Gamut
 
-__all__ = ["PretrainingConfig", "check_settings", "pretrain"]
+__all__ = ["PretrainingConfig", "check_settings", "check_sizes", "pretrain"]
 
 ANY_HUE = Gamut(0.0, 1e6, 0.0, 1e6)
 MAX_STEPS = 4
@@ -52,10 +54,32 @@ SCORED_PATCHES = 8
 """Patches per scene that tell what the network has learned from."""
 SETTINGS = "settings"
 """Name in a checkpoint of the settings of its training."""
+BEGINNING = "beginning"
+"""Name in a checkpoint of how its training began."""
+UNKNOWN = "unknown"
+"""Stands for what a checkpoint of an earlier version does not say."""
 MAY_CHANGE = ("iterations", "device", "drawing_processes", "most_seconds", "checkpoint_seconds")
 """Settings that a training which goes on may have otherwise than the one that wrote its checkpoint."""
 
 logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class _Beginning:
+    """How a training began, for its record, whoever makes its last steps; ready for JSON.
+
+    Args:
+        start: digest of the weights that it began with; None for random ones, `UNKNOWN` where a checkpoint
+            of an earlier version does not say.
+        before: record of these weights; None and `UNKNOWN` as above.
+        about: whatever its caller said of it, such as the command.
+        resumed: what each call said that went on from a checkpoint.
+    """
+
+    start: str | None
+    before: dict[str, Any] | str | None
+    about: dict[str, Any]
+    resumed: Sequence[dict[str, Any]] = ()
 
 
 class PretrainingConfig(StageConfig):
@@ -125,6 +149,7 @@ def pretrain(
     *,
     stage: str = "pretrain",
     checkpoint: Path | None = None,
+    about: Mapping[str, Any] | None = None,
 ) -> EmbeddedEnhancer:
     """Train on pretraining scenes; the last ones validate it and calibrate the expected error of one step.
 
@@ -138,13 +163,16 @@ def pretrain(
         stage: named in progress events.
         checkpoint: file that the training is written to every now and then, and goes on from if it is there;
             it may have been written on another device, and for another number of iterations, time and
-            processes, not with other settings. None keeps none.
+            processes, not with other settings or other weights to start from. None keeps none.
+        about: of this call, ready for JSON: the record has it beside the settings. Of a training that goes on
+            it is that of the beginning, and what was given later is listed as `resumed`.
 
     Raises:
-        ConfigError: when the number of files does not fit the settings, or as `check_settings`.
+        ConfigError: when the number of files does not fit the settings, or as `check_settings` and
+            `check_sizes`.
         WeightsError: when a file is not a pretraining scene, the perceptual distance has no weights, or the
-            checkpoint is of a training with other settings.
-        DivergedError: when the loss stops being finite.
+            checkpoint is of a training with other settings, or that began with other weights.
+        DivergedError: when the loss or a weight stops being finite.
     """
     if len(files) != config.scenes or config.validation_scenes >= config.scenes:
         raise ConfigError(
@@ -152,6 +180,8 @@ def pretrain(
             f"{config.validation_scenes} are for validation"
         )
     device = check_settings(config, start)
+    kept, unseen = files[: -config.validation_scenes], files[-config.validation_scenes :]
+    check_sizes(config, [PretrainingScene.size_of(file) for file in kept])
     perceptual = Lpips.load(net="squeeze").to(device) if config.perceptual else None
     generator = torch.Generator().manual_seed(config.seed)
     network = _starting_network(config, start, generator).to(device)
@@ -171,17 +201,24 @@ def pretrain(
         adversary_rate=config.adversary_rate,
     )
     training = NetworkTraining(network, settings, generator, stage=stage)
+    beginning = _Beginning(
+        None if start is None else _digest(start.network),
+        None if start is None else start.record,
+        dict(about or {}),
+    )
     if checkpoint is not None and checkpoint.exists():
-        _go_on(training, checkpoint, config)
+        beginning = _go_on(training, checkpoint, config, beginning)
         generator.manual_seed(config.seed + training.iteration)
         logger.info("%s: going on from %s, step %d", stage, checkpoint, training.iteration)
-    sampler = partial(_mixed_sampler, files[: -config.validation_scenes], config, training.iteration)
+    sampler = partial(_mixed_sampler, kept, config, training.iteration)
     with drawn_in_processes(sampler, config.drawing_processes) as draw:
-        _train(training, draw, config, checkpoint)
+        _train(training, draw, config, checkpoint, beginning)
     network, history = training.finished().cpu(), training.history
     record: dict[str, Any] = {
         "pretraining": config.model_dump(mode="json"),
-        "before": None if start is None else start.record,
+        "before": beginning.before,
+        **beginning.about,
+        **({"resumed": list(beginning.resumed)} if beginning.resumed else {}),
         "threads": torch.get_num_threads(),
         "iterations_made": training.iteration,
         "history": history[:: max(1, len(history) // 200)],
@@ -189,7 +226,6 @@ def pretrain(
     trained = EmbeddedEnhancer(
         network, 1, 1, config.seed, half, ANY_HUE, record, deterministic=config.deterministic
     )
-    kept, unseen = files[: -config.validation_scenes], files[-config.validation_scenes :]
     return replace(_scored(trained, unseen, config), domain=_domain(trained, kept, unseen))
 
 
@@ -223,11 +259,36 @@ def check_settings(config: PretrainingConfig, start: EmbeddedEnhancer | None) ->
     return chosen_device(config.device, "pretraining.device")
 
 
+def check_sizes(config: PretrainingConfig, sizes: Sequence[tuple[int, int]]) -> None:
+    """Look whether one size of crops and of patches fits all scenes: those of a batch come from several.
+
+    Args:
+        config: budget.
+        sizes: height and width in pixels of the images of each scene that is trained on.
+
+    Raises:
+        ConfigError: when crops or patches would be smaller in some scenes than in others; says which size
+            fits all.
+    """
+    asked = {"crop": (config.crop, SIZE_MULTIPLE)}
+    if config.generative:
+        asked["patch_px"] = (config.patch_px, PATCH_SIDE_MULTIPLE)
+    for name, (side, multiple) in asked.items():
+        found = {min(side, *size) // multiple * multiple: size for size in sizes}
+        if len(found) > 1:
+            height, width = found[min(found)]
+            raise ConfigError(
+                f"{name}={side}: images of some scenes ({width}x{height} px) are too small for it, and "
+                f"all of a batch have one size; set {name}={min(found)}"
+            )
+
+
 def _train(
     training: NetworkTraining,
     draw: Callable[[], Batch],
     config: PretrainingConfig,
     checkpoint: Path | None,
+    beginning: _Beginning,
 ) -> None:
     """Steps until iterations or time are spent; batches are drawn while the network computes."""
     begun = written = time.monotonic()
@@ -239,30 +300,59 @@ def _train(
             training.step(batch)
             now = time.monotonic()
             if checkpoint is not None and now - written > config.checkpoint_seconds:
-                _write(checkpoint, training, config)
+                _write(checkpoint, training, config, beginning)
                 written = now
             if config.most_seconds is not None and now - begun > config.most_seconds:
                 break
         following.cancel()
     if checkpoint is not None:
-        _write(checkpoint, training, config)
+        _write(checkpoint, training, config, beginning)
 
 
-def _write(file: Path, training: NetworkTraining, config: PretrainingConfig) -> None:
-    """A checkpoint, with the settings that shaped the training so far."""
-    settings = torch.frombuffer(bytearray(json.dumps(_lasting(config)).encode()), dtype=torch.uint8)
-    save_safetensors(file, {**training.state(), SETTINGS: settings})
+def _write(file: Path, training: NetworkTraining, config: PretrainingConfig, beginning: _Beginning) -> None:
+    """A checkpoint, with the settings that shaped the training so far, and how it began.
+
+    Raises:
+        DivergedError: when a weight is not finite: no training goes on from there.
+    """
+    training.check_finite()
+    further = {SETTINGS: _as_tensor(_lasting(config)), BEGINNING: _as_tensor(asdict(beginning))}
+    save_safetensors(file, {**training.state(), **further})
+
+
+def _as_tensor(value: dict[str, Any]) -> UInt8[Tensor, "b"]:
+    """What is ready for JSON as bytes, which a file of tensors can hold."""
+    return torch.frombuffer(bytearray(json.dumps(value).encode()), dtype=torch.uint8)
+
+
+def _digest(network: RestorationNetwork) -> str:
+    """Of all weights, by content: the file they are read from may lie elsewhere."""
+    digest = hashlib.blake2b(digest_size=16)
+    for name, value in network.state_dict().items():
+        digest.update(f"{name} {tuple(value.shape)}\0".encode())
+        digest.update(value.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()
 
 
 def _lasting(config: PretrainingConfig) -> dict[str, Any]:
     return config.model_dump(mode="json", exclude=set(MAY_CHANGE))
 
 
-def _go_on(training: NetworkTraining, file: Path, config: PretrainingConfig) -> None:
+def _go_on(training: NetworkTraining, file: Path, config: PretrainingConfig, now: _Beginning) -> _Beginning:
     """Take over a checkpoint.
 
+    Args:
+        training: changed in place.
+        file: the checkpoint.
+        config: of this call.
+        now: what the training would begin with if there were no checkpoint.
+
+    Returns:
+        How the training began, and with what it was resumed, this time included.
+
     Raises:
-        WeightsError: when the file is none, or of a training with other settings.
+        WeightsError: when the file is none, or of a training with other settings, or that began with other
+            weights.
     """
     try:
         state = load_safetensors(file)
@@ -275,12 +365,19 @@ def _go_on(training: NetworkTraining, file: Path, config: PretrainingConfig) -> 
         ]
         if changed:
             raise ValueError(f"its settings are others: {', '.join(changed)}")
+        if BEGINNING in state:
+            began = _Beginning(**json.loads(bytes(state[BEGINNING].numpy())))
+        else:
+            began = _Beginning(UNKNOWN, UNKNOWN, dict.fromkeys(now.about, UNKNOWN))
+        if began.start not in (UNKNOWN, now.start):
+            raise ValueError("it began with other weights")
         training.restore(state)
     except (OSError, RuntimeError, ValueError, KeyError, TypeError) as error:
         raise WeightsError(
-            f"{file}: not a checkpoint of this training ({error}); give the same settings, or remove it to "
-            "begin anew"
+            f"{file}: not a checkpoint of this training ({error}); give the same settings and start, or "
+            "remove it to begin anew"
         ) from error
+    return replace(began, resumed=(*began.resumed, now.about))
 
 
 def _mixed_sampler(
@@ -292,12 +389,6 @@ def _mixed_sampler(
         for index, file in enumerate(files)
         if index % processes == number
     ]
-    smallest = min(samplers, key=lambda sampler: sampler.side_px)
-    if smallest.side_px < max(sampler.side_px for sampler in samplers):
-        raise ConfigError(
-            f"crop={config.crop}: images of some scenes are too small for it, and a batch has crops of one "
-            f"size; set crop={smallest.side_px}"
-        )
     seed = config.seed + iteration + 1_000_003 * number
     return MixedSampler(samplers, batch=config.batch, seed=seed).draw
 

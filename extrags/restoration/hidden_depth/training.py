@@ -89,7 +89,7 @@ def train_hidden_depth(
 
     Raises:
         ConfigError: when there are not more scenes than those for validation, or none has a hole.
-        DivergedError: when the loss stops being finite.
+        DivergedError: as `train_completion`.
     """
     if len(files) <= config.validation_scenes:
         raise ConfigError(

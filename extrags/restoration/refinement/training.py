@@ -81,7 +81,7 @@ def train_refiner(
     Raises:
         ConfigError: when there are not more scenes than those for validation.
         WeightsError: when the perceptual distance has no weights.
-        DivergedError: when the loss stops being finite.
+        DivergedError: when the loss or a weight stops being finite.
     """
     if len(files) <= config.validation_scenes:
         raise ConfigError(

@@ -152,11 +152,6 @@ class CropSampler:
         self._generator = np.random.default_rng([seed, 2])
         self._order: list[int] = []
 
-    @property
-    def side_px(self) -> int:
-        """Of its crops, which is smaller than asked for where the images are."""
-        return self._side
-
     def draw(self) -> Batch:
         """The next batch."""
         crops, patches = [], []

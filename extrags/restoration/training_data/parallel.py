@@ -36,7 +36,7 @@ def drawn_in_processes(
         workers: processes; with 0 batches are drawn where they are asked for.
 
     Raises:
-        ExtragsError: by the returned function, when a process has ended.
+        ExtragsError: by the returned function, what a process raised, or that one has ended.
     """
     if workers == 0:
         yield make_sampler(0, 1)
@@ -61,20 +61,26 @@ def drawn_in_processes(
 def _taken(queue: Any, process: BaseProcess) -> Batch:
     while True:
         try:
-            batch: Batch = queue.get(timeout=LOOK_SECONDS)
+            given: Batch | ExtragsError = queue.get(timeout=LOOK_SECONDS)
         except Empty:
             if not process.is_alive():
                 raise ExtragsError(
                     f"a process that draws training batches ended with exit code {process.exitcode}"
                 ) from None
         else:
-            return batch
+            if isinstance(given, ExtragsError):
+                raise given
+            return given
 
 
 def _draw(
     make_sampler: Callable[[int, int], Callable[[], Batch]], number: int, workers: int, queue: Any
 ) -> None:
     torch.set_num_threads(1)
-    sampler = make_sampler(number, workers)
-    while True:
-        queue.put(sampler())
+    try:
+        sampler = make_sampler(number, workers)
+        while True:
+            queue.put(sampler())
+    except ExtragsError as error:
+        # Its sentence says what to do; a process that merely ends would say nothing.
+        queue.put(error)

@@ -155,6 +155,22 @@ class PretrainingScene:
         except (OSError, SafetensorError):
             return None
 
+    @staticmethod
+    def size_of(path: Path) -> tuple[int, int]:
+        """Height and width in pixels of a file's images; nothing but its header is read.
+
+        Raises:
+            WeightsError: when the file holds no pretraining scene.
+        """
+        from safetensors import SafetensorError, safe_open
+
+        try:
+            with safe_open(str(path), "pt") as file:
+                height, width = file.get_slice("target").get_shape()[-2:]
+        except (OSError, SafetensorError, ValueError) as error:
+            raise WeightsError(f"{path}: not the pairs of a pretraining scene ({error})") from error
+        return int(height), int(width)
+
     @classmethod
     def load(cls, path: Path) -> PretrainingScene:
         """Read what `save` wrote.

@@ -331,6 +331,40 @@ class TestSparseDepth:
         assert len(found.z) >= 20
         assert found.z.max() < 40
 
+    @pytest.mark.parametrize("source", ["depth", "points"])
+    def test_a_frame_without_depth_ends_no_training(
+        self, source: str, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        sequence = slanted_plane()
+        assert sequence.depth_mm is not None
+        first, second = sequence.train[:2]
+        mask, depth_mm = sequence.mask.copy(), sequence.depth_mm.copy()
+        if source == "depth":
+            depth_mm[first] = 0
+            sequence = replace(sequence, depth_mm=depth_mm)
+        else:
+            rays = unproject_pixels(np.random.default_rng(0).uniform(4, 36, size=(40, 2)), sequence.K[0])
+            mask[first] = False
+            sequence = replace(sequence, points=20 * rays, depth_mm=None, mask=mask)
+        with caplog.at_level("WARNING", logger="extrags.baselines.uc_nerf.training"):
+            found = sparse_depths(sequence, sequence.train, 24)
+        assert len(found[0].z) == 0
+        assert len(found[1].z) >= 4
+        assert f"in 1 of {len(sequence.train)} training frames" in caplog.text
+        assert f"({sequence.frame_name(int(first))})" in caplog.text
+        assert sequence.frame_name(int(second)) not in caplog.text
+        if source == "depth":
+            history = train(sequence, TINY.model_copy(update={"iterations": len(sequence.train)})).history
+            assert all(np.isfinite(entry["loss"]) for entry in history)
+
+    def test_depth_at_too_few_pixels_of_all_frames_is_an_error(self) -> None:
+        sequence = slanted_plane()
+        assert sequence.depth_mm is not None
+        depth_mm = np.zeros_like(sequence.depth_mm)
+        depth_mm[:, 20, 20] = 20
+        with pytest.raises(CaptureError, match=r"none of \d+ training frames has 4 pixels of known depth"):
+            sparse_depths(replace(sequence, depth_mm=depth_mm), sequence.train, 24)
+
     def test_cameras_alone_must_do(self, caplog: pytest.LogCaptureFixture) -> None:
         """Neither depth nor points: colours supervise, between depths that follow from the cameras."""
         sequence = replace(slanted_plane(), depth_mm=None)

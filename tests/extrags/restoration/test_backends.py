@@ -35,6 +35,7 @@ from extrags.restoration.backends import (
 from extrags.restoration.benchmark.comparison import check_methods, prepared
 from extrags.restoration.classical import ClassicalBackend, ClassicalEnhancer
 from extrags.restoration.clips import render_clips
+from extrags.restoration.description import DESCRIPTION, read_description, write_description
 from extrags.restoration.pretrained import enhancer as pipelines
 from extrags.restoration.pretrained.enhancer import DiffusersBackend
 from extrags.restoration.protocol import Backend, Clip, Enhancer, Restoration
@@ -303,3 +304,20 @@ class TestNames:
             "assert not {'diffusers', 'transformers'} & set(sys.modules)"
         )
         subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
+
+
+def test_a_description_that_cannot_be_written_leaves_the_older_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_description(tmp_path, {"backend": "older"})
+
+    def full(path: Path, content: bytes) -> int:
+        with path.open("wb") as file:
+            file.write(content[:5])
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(OSError, match="no space left"):
+        write_description(tmp_path, {"backend": "newer"})
+    assert read_description(tmp_path / DESCRIPTION) == {"backend": "older"}
+    assert len(list(tmp_path.iterdir())) == 1

@@ -12,7 +12,7 @@ from extrags.config import PipelineConfig, profile_config
 from extrags.depth.completion import SEEN, STEREO
 from extrags.depth.hidden import SOLID
 from extrags.depth.weights import load_completion
-from extrags.errors import CaptureError, ConfigError, WeightsError
+from extrags.errors import CaptureError, ConfigError, DivergedError, WeightsError
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.diffusion.weights import COLONS, starting_weights
 from extrags.restoration.hidden_depth import training as training_module
@@ -176,6 +176,22 @@ class TestTraining:
         # Smooth filling stays near where the wall falls back.
         assert scores["smooth"]["bias"] == pytest.approx(-scores["smooth"]["error"])
         assert record["examples"] == 8
+
+    def test_weights_that_are_not_finite_end_it(
+        self, files: list[Path], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """Fewer steps than those after which the loss is looked at."""
+
+        def infinite(*given: torch.Tensor) -> dict[str, torch.Tensor]:
+            return {name: value * float("inf") for name, value in hidden_depth_loss(*given).items()}
+
+        monkeypatch.setattr(training_module, "LONGEST_SIDES_PX", (32,))
+        monkeypatch.setattr(training_module, "hidden_depth_loss", infinite)
+        start = load_completion("bundled")
+        assert start is not None
+        config = HiddenDepthConfig(scenes=3, validation_scenes=1, iterations=2, batch=2)
+        with pytest.raises(DivergedError, match="is not finite at the end"):
+            train_hidden_depth(files, config, start)
 
     def test_scenes_have_to_be_left(self, files: list[Path], tmp_path: Path) -> None:
         start = load_completion("bundled")

@@ -1,9 +1,13 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from multiprocessing import current_process
 from pathlib import Path
+from queue import Queue
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,11 +15,19 @@ import torch
 
 from extrags.array_files import load_safetensors, save_safetensors
 from extrags.config import CoarseConfig, profile_config
-from extrags.errors import ConfigError, WeightsError
+from extrags.errors import CaptureError, ConfigError, DivergedError, WeightsError
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.diffusion.frame_features import frame_features
 from extrags.restoration.diffusion.network import build_network
-from extrags.restoration.diffusion.pretraining import PretrainingConfig, _mixed_sampler, pretrain
+from extrags.restoration.diffusion.network_training import NetworkTraining
+from extrags.restoration.diffusion.pretraining import (
+    PretrainingConfig,
+    _mixed_sampler,
+    check_sizes,
+    pretrain,
+)
+from extrags.restoration.training_data import parallel
+from extrags.restoration.training_data.augmentation import Batch
 from extrags.restoration.training_data.parallel import drawn_in_processes
 from extrags.restoration.training_data.pretraining_scenes import (
     PRETRAINING_DATA_VERSION,
@@ -126,10 +138,21 @@ class TestPretrainingScene:
     ) -> None:
         monkeypatch.setattr("extrags.restoration.training_data.degradation.ITERATIONS", (10, 20))
         monkeypatch.setattr("extrags.restoration.training_data.degradation._WITH_LIGHT", 1.0)
-        module = "extrags.restoration.training_data.explored_views.explore"
-        monkeypatch.setattr(module, lambda *_given, **_named: type("Nothing", (), {"trajectories": ()}))
+        module = "extrags.restoration.training_data.explored_views"
+        monkeypatch.setattr(
+            f"{module}.explore", lambda *_given, **_named: type("Nothing", (), {"trajectories": ()})
+        )
         found = make_pretraining_scene(tube_recording(tube), RUN, 3, explored=True)
         assert torch.equal(found.pairs.layers.data, scene.pairs.layers.data)
+
+        def too_poor(*_given: object, **_named: object) -> None:
+            raise CaptureError("the fused depth of 10 views holds no surface")
+
+        for step in ("fuse_surface", "carve"):
+            with monkeypatch.context() as patch:
+                patch.setattr(f"{module}.{step}", too_poor)
+                found = make_pretraining_scene(tube_recording(tube), RUN, 3, explored=True)
+            assert torch.equal(found.pairs.layers.data, scene.pairs.layers.data)
 
     def test_training_frames_are_kept_as_references(self, tube: Tube, scene: PretrainingScene) -> None:
         train = tube.sequence.train
@@ -240,10 +263,42 @@ class TestPretraining:
         short = TINY.model_copy(update={"most_seconds": 1e-3})
         pretrain(files, short, checkpoint=checkpoint)
         state = load_safetensors(checkpoint)
-        del state["settings"]
+        del state["settings"], state["beginning"]
         save_safetensors(checkpoint, state)
         other = short.model_copy(update={"learning_rate": 1e-3})
-        assert pretrain(files, other, checkpoint=checkpoint).record["iterations_made"] == 2
+        record = pretrain(files, other, checkpoint=checkpoint, about={"command": "second"}).record
+        assert record["iterations_made"] == 2
+        assert (record["before"], record["command"]) == ("unknown", "unknown")
+        # It stays unknown.
+        record = pretrain(files, other, checkpoint=checkpoint, about={"command": "third"}).record
+        assert record["command"] == "unknown"
+        assert [later["command"] for later in record["resumed"]] == ["second", "third"]
+
+    def test_it_goes_on_from_the_weights_that_it_began_with(self, files: list[Path], tmp_path: Path) -> None:
+        checkpoint = tmp_path / "checkpoint.safetensors"
+        short = TINY.model_copy(update={"most_seconds": 1e-3})
+        starts = [
+            EmbeddedEnhancer(
+                build_network(
+                    CONDITION_CHANNELS, TINY.channels, torch.Generator().manual_seed(seed), generative=False
+                ),
+                *(1, 1, 0, False, Gamut(0.0, 1e6, 0.0, 1e6)),
+                {"command": f"start {seed}"},
+            )
+            for seed in range(2)
+        ]
+        first = pretrain(files, short, starts[0], checkpoint=checkpoint, about={"command": "first"}).record
+        assert "resumed" not in first
+        for other in (starts[1], None):
+            with pytest.raises(WeightsError, match="it began with other weights"):
+                pretrain(files, short, other, checkpoint=checkpoint)
+        # The same weights, though their record is worded otherwise.
+        same = replace(starts[0], record={"command": "moved"})
+        record = pretrain(files, short, same, checkpoint=checkpoint, about={"command": "second"}).record
+        assert record["iterations_made"] == 2
+        assert record["before"] == {"command": "start 0"}
+        assert record["command"] == "first"
+        assert record["resumed"] == [{"command": "second"}]
 
     def test_a_training_that_goes_on_keeps_the_record_of_its_beginning(
         self, files: list[Path], tmp_path: Path
@@ -254,6 +309,24 @@ class TestPretraining:
         history = pretrain(files, longer, checkpoint=checkpoint).record["history"]
         assert [entry["iteration"] for entry in history] == [10, 12, 20]
         assert history[:2] == first
+
+    def test_weights_that_are_not_finite_end_it(
+        self, files: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """The loss of the last step is that of the weights before it."""
+        descend = NetworkTraining._descend
+
+        def last_one_diverges(training: NetworkTraining, *given: Any) -> None:
+            descend(training, *given)
+            if training.iteration == TINY.iterations - 1:
+                next(training.network.parameters()).data.fill_(float("nan"))
+
+        monkeypatch.setattr(NetworkTraining, "_descend", last_one_diverges)
+        checkpoint = tmp_path / "checkpoint.safetensors"
+        for file in (None, checkpoint):
+            with pytest.raises(DivergedError, match="weights are not finite after iteration 12"):
+                pretrain(files, TINY, checkpoint=file)
+        assert not checkpoint.exists()
 
     def test_crops_of_several_sizes_are_refused(
         self, scene: PretrainingScene, files: list[Path], tmp_path: Path
@@ -269,8 +342,46 @@ class TestPretraining:
         )
         small = tmp_path / "small.safetensors"
         replace(scene, pairs=lower, references=scene.references).save(small)
-        with pytest.raises(ConfigError, match=r"crop=48: images of some scenes are too small.*set crop=40"):
+        told = r"crop=48: images of some scenes \(64x40 px\) are too small.*set crop=40"
+        with pytest.raises(ConfigError, match=told):
             pretrain([files[0], small, files[1]], TINY.model_copy(update={"crop": 48}))
+
+    def test_patches_of_several_sizes_are_refused(self) -> None:
+        config = PretrainingConfig(generative=True, crop=96, patch_px=128)
+        check_sizes(config, [(144, 160), (128, 160)])
+        with pytest.raises(
+            ConfigError, match=r"patch_px=128: .* \(176x112 px\) are too small.*set patch_px=112"
+        ):
+            check_sizes(config, [(144, 160), (112, 176)])
+        # Others show no patches.
+        check_sizes(config.model_copy(update={"generative": False}), [(144, 160), (112, 176)])
+
+    def test_a_file_that_is_no_scene_has_no_size(self, tmp_path: Path) -> None:
+        (tmp_path / "x.safetensors").write_bytes(b"nothing")
+        save_safetensors(tmp_path / "y.safetensors", {"other": torch.zeros(1)})
+        for name in ("x", "y"):
+            with pytest.raises(WeightsError, match=rf"{name}\.safetensors: not the pairs"):
+                PretrainingScene.size_of(tmp_path / f"{name}.safetensors")
+
+    def test_what_a_process_raises_is_told(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(torch, "set_num_threads", lambda _count: None)
+
+        def refused(number: int, workers: int) -> Callable[[], Batch]:
+            raise ConfigError(f"process {number} of {workers}: images are too small")
+
+        given: Queue = Queue()
+        parallel._draw(refused, 1, 2, given)
+        with pytest.raises(ConfigError, match="process 1 of 2: images are too small"):
+            parallel._taken(given, current_process())
+
+    @pytest.mark.slow  # Each of them imports torch.
+    def test_what_a_process_raises_is_told_by_its_parent(self, tmp_path: Path) -> None:
+        missing = partial(_mixed_sampler, [tmp_path / "gone.safetensors"] * 2, TINY, 0)
+        with (
+            drawn_in_processes(missing, 2) as draw,
+            pytest.raises(WeightsError, match=r"gone\.safetensors: not the pairs"),
+        ):
+            draw()
 
     def test_more_processes_than_scenes_are_refused(self, files: list[Path]) -> None:
         with pytest.raises(ConfigError, match="drawing_processes=3: there are 2 scenes"):
