@@ -10,6 +10,7 @@ from jaxtyping import Int
 
 from extrags.errors import ShapeError
 from extrags.events import Progress, emit
+from extrags.facing import one_sided_rendering
 from extrags.frame_stacks import FrameStack
 from extrags.metrics.lpips import LpipsByNet, available_lpips
 from extrags.metrics.protocol import EvaluationResult, RenderedViews, evaluate_views
@@ -33,7 +34,9 @@ def render(
     """Render frames of a sequence by the rules of the evaluation protocol.
 
     Training frames are rendered at their own exposure; held-out frames of a recording with training frames
-    at the exposure interpolated between these; frames of other recordings at the mean exposure.
+    at the exposure interpolated between these; frames of other recordings at the mean exposure. What a view
+    sees from behind stands behind all else, where the scene knows its sides
+    (`extrags.facing.one_sided_rendering`).
 
     Args:
         scene: the scene, rendered where it is.
@@ -56,7 +59,7 @@ def render(
     with torch.no_grad():
         for done, frame in enumerate(frames, start=1):
             exposure = None if gains is None else gains[done - 1 : done]
-            rendering = scene.render(sequence.cameras[int(frame)], exposure=exposure)
+            rendering = one_sided_rendering(scene, sequence.cameras[int(frame)], exposure=exposure)
             rgb.append(rendering.rgb[0].cpu().numpy())
             alpha.append(rendering.alpha[0].cpu().numpy())
             depth.append(rendering.depth[0].cpu().numpy())

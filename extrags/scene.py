@@ -8,17 +8,18 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int8
 from torch import Tensor
 from torch.nn import functional
 
 from extrags.cameras import Cameras
+from extrags.errors import ShapeError
 from extrags.gaussians import Gaussians
 from extrags.illumination import NearFieldLight
 from extrags.raster import CameraLight, Rendering, rasterize
 from extrags.store.storable import Storable
 from extrags.threads import one_torch_thread
-from extrags.zarr_io import group_exists
+from extrags.zarr_io import group_exists, new_group, open_group, read_array, write_array
 
 __all__ = ["NEAR", "SHALLOWEST", "Scene"]
 
@@ -31,12 +32,30 @@ SHALLOWEST = 20 * NEAR
 
 @dataclass(frozen=True)
 class Scene(Storable):
-    """Gaussians, and the near-field light if the scene was reconstructed with one."""
+    """Gaussians, and the near-field light if the scene was reconstructed with one.
+
+    Args:
+        gaussians: what the scene is made of.
+        light: lamp and exposures; None for colours as they are.
+        facing: 1 where a Gaussian's shortest axis points to the side from which it was seen, -1 where it
+            points to the other, 0 where it has no sides, [N]; None where nobody knows. Views of evaluation go
+            by it (`extrags.facing`), `render` does not.
+
+    Raises:
+        ShapeError: for sides of another number of Gaussians.
+    """
 
     stored_as: ClassVar[str] = "scene"
 
     gaussians: Gaussians
     light: NearFieldLight | None = None
+    facing: Int8[Tensor, "n"] | None = None
+
+    def __post_init__(self) -> None:
+        if self.facing is not None and self.facing.shape != (len(self.gaussians),):
+            raise ShapeError(
+                f"facing has shape {tuple(self.facing.shape)}, expected ({len(self.gaussians)},)"
+            )
 
     def __repr__(self) -> str:
         return f"Scene({self.gaussians!r}, {'without' if self.light is None else 'near-field'} light)"
@@ -59,7 +78,10 @@ class Scene(Storable):
         """The same scene on a device; this very one where it is there already."""
         if self.device == torch.device(device):
             return self
-        return Scene(self.gaussians.to(device), None if self.light is None else self.light.to(device))
+        light = None if self.light is None else self.light.to(device)
+        return Scene(
+            self.gaussians.to(device), light, None if self.facing is None else self.facing.to(device)
+        )
 
     @one_torch_thread()
     def render(
@@ -156,17 +178,23 @@ class Scene(Storable):
     def detached(self) -> Scene:
         """A copy without gradient history."""
         light = None if self.light is None else self.light.detached()
-        return Scene(self.gaussians.detached(), light)
+        return Scene(self.gaussians.detached(), light, None if self.facing is None else self.facing.clone())
 
     def save(self, path: Path) -> None:
-        """Write the groups `gaussians` and, if there is one, `light`."""
+        """Write the groups `gaussians` and, where there are some, `light` and `facing`."""
         path.mkdir(parents=True, exist_ok=True)
         self.gaussians.save(path / "gaussians")
         if self.light is not None:
             self.light.save(path / "light")
+        if self.facing is not None:
+            with new_group(path / "facing") as group:
+                write_array(group, "facing", self.facing.cpu().numpy())
 
     @classmethod
     def load(cls, path: Path) -> Scene:
         """Read what `save` wrote."""
         light = NearFieldLight.load(path / "light") if group_exists(path / "light") else None
-        return cls(Gaussians.load(path / "gaussians"), light)
+        facing = None
+        if group_exists(path / "facing"):
+            facing = torch.from_numpy(read_array(open_group(path / "facing"), "facing"))
+        return cls(Gaussians.load(path / "gaussians"), light, facing)

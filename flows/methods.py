@@ -131,6 +131,7 @@ def three_dgs(config: PipelineConfig) -> dict[str, Any]:
         "coarse.light.enabled": False,
         "coarse.min_footprint_px": 0.0,
         "coarse.inconsistent_frames": "ignore",
+        "coarse.one_sided": False,
         "coarse.refine_poses": False,
     }
 

@@ -64,7 +64,7 @@ def judge(
     slot.counts["amount"] = judgement.amount
 
 
-@stage("finetune", version=21)
+@stage("finetune", version=22)
 def finetune(
     slot: Slot,
     scene: Ref,

@@ -168,6 +168,11 @@ class CoarseConfig(StageConfig):
         1 / 30, ge=0, lt=1, description="from this share of the iterations the normal term is active"
     )
     normal_every: int = Field(2, ge=1, description="iterations from one use of the normal term to the next")
+    one_sided: bool = Field(
+        True,
+        description="held-out views of the coarse and the final scene show Gaussians that they see from "
+        "behind only where there is nothing else",
+    )
     train_on: Literal["train", "all"] = Field(
         "train",
         description="all: held-out frames are trained on too. The method oracle alone does this, as a "

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from extrags.config import DEFAULT_PROFILE, PROFILES, CoarseConfig, FinetuneConfig
+from extrags.facing import with_facing
 from extrags.gaussians import Gaussians
 from extrags.pseudo_views import PseudoViews
 from extrags.scene import Scene
@@ -69,6 +70,9 @@ def finetune(
     what was restored and what the scene has become, mixed (`shown_again`), holes that are left get new
     Gaussians, and pattern and learning rates start anew.
 
+    With `coarse.one_sided` the scene is told from which side the views saw its Gaussians
+    (`extrags.facing.with_facing`).
+
     With `keep_scene` the scene's own Gaussians and its light stay as they are: only new ones in holes are
     learned, without densification; where there are none, the scene is returned as it was given.
 
@@ -99,6 +103,14 @@ def finetune(
             config = config.model_copy(update={"rounds": 1})
         load = pseudo_views if callable(pseudo_views) else _loaded_once(pseudo_views, config.rounds)
         del pseudo_views
+        seen_from = [sequence.cameras[sequence.train]]
+
+        def remembered() -> PseudoViews | None:
+            views = load()
+            if views is not None and len(seen_from) == 1:
+                seen_from.append(views.cameras)
+            return views
+
         if config.rounds > 1 and coarse.inconsistent_frames == "weight" and frame_weights is None:
             # Once for all rounds.
             frame_weights = found_weights(sequence, sequence.train)
@@ -107,7 +119,7 @@ def finetune(
             found = _round(
                 number,
                 current,
-                load,
+                remembered,
                 sequence,
                 config,
                 coarse,
@@ -118,6 +130,8 @@ def finetune(
             before = sum(config.steps_of_rounds[:number])
             history += [{**entry, "iteration": entry["iteration"] + before} for entry in found.history]
             current = found.scene
+        if coarse.one_sided:
+            current = with_facing(current, seen_from)
         return TrainingResult(current, history)
 
 

@@ -13,6 +13,7 @@ from extrags.arguments import check_sequence_argument, check_settings_argument
 from extrags.cameras import Cameras
 from extrags.config import DEFAULT_PROFILE, PROFILES, CoarseConfig, DensifyConfig
 from extrags.errors import CaptureError, ConfigError
+from extrags.facing import with_facing
 from extrags.illumination import NearFieldLight
 from extrags.scene import NEAR, SHALLOWEST, Scene
 from extrags.sequence import EndoscopicSequence
@@ -110,6 +111,9 @@ def reconstruct(
         poses=poses,
         footprint=smallest_footprint(config, cameras),
     )
+    if config.one_sided:
+        # Refined poses differ by far too little to change a side.
+        result = replace(result, scene=with_facing(result.scene, [cameras]))
     return replace(result, frame_weights=weights)
 
 

@@ -1,0 +1,133 @@
+"""Which way surfaces face, and views in which what is seen from behind stands behind everything else.
+
+Tissue is opaque, and no camera is inside of it: a wall that a view sees from behind is not where it stands.
+It happens where the restorer guesses that an unseen stretch of a lumen ends, and a later view looks from
+beyond that guess back at what training frames know. Gaussians are flat on the surface, so that each has a
+side from which it was seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
+
+from extrags.cameras import Cameras
+from extrags.raster import Rendering
+from extrags.raster.light import shortest_axes
+from extrags.scene import Scene
+from extrags.threads import one_torch_thread
+
+__all__ = ["one_sided_rendering", "with_facing"]
+
+SEEN_WEIGHT = 0.01
+"""A view whose largest blending weight of a Gaussian is smaller does not say which side it saw."""
+
+SURE_COSINE = 0.2
+"""Mean cosine, over the views that saw a Gaussian, between its normal and the directions to their cameras,
+below which none of its sides is told from the other."""
+
+BEHIND_COSINE = 0.2
+"""Below minus this cosine a Gaussian is seen from behind: at grazing angles normals are noise."""
+
+FLAT = 0.5
+"""Shortest axis, as a share of the next one, below which a Gaussian is a piece of surface with two sides."""
+
+MOST_VIEWS = 120
+"""So many training views, and as many virtual ones, are asked; of more, evenly spaced ones."""
+
+WIDTH_PX = 160
+"""Views are rendered no wider for this."""
+
+
+@one_torch_thread()
+def with_facing(scene: Scene, cameras: Iterable[Cameras]) -> Scene:
+    r"""The same scene with the side of each Gaussian that faces the views it was made from.
+
+    With the normal :math:`n_i` (shortest axis) of a Gaussian, the directions :math:`d_{iv}` to the cameras
+    and its largest blending weights :math:`w_{iv}` in their views, the side is the sign of
+    :math:`\sum_v w_{iv} \, n_i \cdot d_{iv}`; 0, neither side, where no view saw it, where the weighted mean
+    of the cosines is below `SURE_COSINE`, and for Gaussians that are not flat.
+
+    Args:
+        scene: the scene, rendered where it is.
+        cameras: batches of views that the scene was made from, training and virtual ones.
+    """
+    gaussians = scene.gaussians
+    normals = _normals(scene)
+    scales = gaussians.scales.detach().exp().sort(dim=1).values
+    flat = scales[:, 0] < FLAT * scales[:, 1]
+    cosines = torch.zeros(len(gaussians), device=scene.device)
+    weights = torch.zeros_like(cosines)
+    for batch in cameras:
+        small = batch.at_most_width(WIDTH_PX)
+        for index in np.linspace(0, len(small) - 1, min(len(small), MOST_VIEWS)).round().astype(int):
+            view = small[int(index)]
+            with torch.no_grad():
+                weight = scene.render(view, visibility=True, sh_degree=0).visibility_max
+            if weight is None:
+                raise AssertionError("visibility was asked for")
+            seen = torch.where(weight[0] >= SEEN_WEIGHT, weight[0], 0)
+            cosines += seen * _cosines(scene, normals, view)
+            weights += seen
+    sure = flat & (weights > 0) & (cosines.abs() >= SURE_COSINE * weights)
+    return replace(scene, facing=torch.where(sure, cosines.sign(), 0).to(torch.int8))
+
+
+@one_torch_thread()
+def one_sided_rendering(
+    scene: Scene, camera: Cameras, *, exposure: Float[Tensor, "1"] | None = None
+) -> Rendering:
+    """Render one view in which Gaussians seen from behind stand behind all others.
+
+    They show where there is nothing else, and hide nothing. For a scene that does not know which way its
+    Gaussians face (`Scene.facing`) it is `Scene.render`.
+
+    Args:
+        scene: the scene, rendered where it is.
+        camera: one view.
+        exposure: its gain; None is the mean exposure of the training frames.
+
+    Returns:
+        Colour, opacity and expected depth; radii and centres are those of the Gaussians seen from the front,
+        0 for the others.
+    """
+    facing = scene.facing
+    if facing is None:
+        return scene.render(camera, exposure=exposure)
+    normals = _normals(scene)
+    behind = facing.to(normals.dtype) * _cosines(scene, normals, camera) < -BEHIND_COSINE
+    if not bool(behind.any()):
+        return scene.render(camera, exposure=exposure)
+    gaussians = scene.gaussians
+    # Of opacity 0 they are culled, at less than it takes to copy all others.
+    opacities = torch.where(behind, -torch.inf, gaussians.opacities)
+    front = replace(scene, gaussians=replace(gaussians, opacities=opacities)).render(
+        camera, exposure=exposure
+    )
+    back = Scene(gaussians.subset(behind), scene.light).render(camera, exposure=exposure)
+    left = 1 - front.alpha
+    alpha = front.alpha + left * back.alpha
+    distance = front.alpha * front.depth + left * back.alpha * back.depth
+    return replace(
+        front,
+        rgb=front.rgb + left[..., None] * back.rgb,
+        alpha=alpha,
+        depth=torch.where(alpha > 0, distance / alpha.clamp_min(torch.finfo(alpha.dtype).tiny), 0),
+    )
+
+
+def _normals(scene: Scene) -> Float[Tensor, "n 3"]:
+    gaussians = scene.gaussians
+    return shortest_axes(gaussians.quats.detach(), gaussians.scales.detach())
+
+
+def _cosines(scene: Scene, normals: Float[Tensor, "n 3"], camera: Cameras) -> Float[Tensor, "n"]:
+    """Cosines between normals and the directions to a camera."""
+    to_camera = scene.array(camera.centers[0]) - scene.gaussians.means.detach()
+    return (functional.normalize(to_camera, dim=1) * normals).sum(dim=1)
