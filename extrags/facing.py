@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
@@ -23,7 +23,15 @@ from extrags.raster.light import shortest_axes
 from extrags.scene import Scene
 from extrags.threads import one_torch_thread
 
-__all__ = ["one_sided_rendering", "with_facing"]
+__all__ = [
+    "BEHIND_COSINE",
+    "laid_over",
+    "one_sided_attributes",
+    "one_sided_rendering",
+    "seen_from_behind",
+    "sides",
+    "with_facing",
+]
 
 SEEN_WEIGHT = 0.01
 """A view whose largest blending weight of a Gaussian is smaller does not say which side it saw."""
@@ -73,7 +81,7 @@ def with_facing(scene: Scene, cameras: Iterable[Cameras]) -> Scene:
             if weight is None:
                 raise AssertionError("visibility was asked for")
             seen = torch.where(weight[0] >= SEEN_WEIGHT, weight[0], 0)
-            cosines += seen * _cosines(scene, normals, view)
+            cosines += seen * _cosines(gaussians.means.detach(), normals, scene.array(view.centers[0]))
             weights += seen
     sure = flat & (weights > 0) & (cosines.abs() >= SURE_COSINE * weights)
     return replace(scene, facing=torch.where(sure, cosines.sign(), 0).to(torch.int8))
@@ -97,20 +105,60 @@ def one_sided_rendering(
         Colour, opacity and expected depth; radii and centres are those of the Gaussians seen from the front,
         0 for the others.
     """
-    facing = scene.facing
-    if facing is None:
+    behind = _behind(scene, camera)
+    if behind is None:
         return scene.render(camera, exposure=exposure)
+    front, back = _parts(scene, behind)
+    return laid_over(front.render(camera, exposure=exposure), back.render(camera, exposure=exposure))
+
+
+@one_torch_thread()
+def one_sided_attributes(
+    scene: Scene, camera: Cameras, attributes: Float[Tensor, "n k"]
+) -> tuple[Float[Tensor, "1 h w k"], Float[Tensor, "1 h w"]]:
+    """`Scene.render_attributes` of one view, with the blending weights of `one_sided_rendering`.
+
+    Args:
+        scene: the scene, rendered where it is.
+        camera: one view.
+        attributes: k values per Gaussian.
+
+    Returns:
+        The attributes summed with the blending weights, and alpha, the sum of the weights.
+    """
+    behind = _behind(scene, camera)
+    if behind is None:
+        return scene.render_attributes(camera, attributes)
+    front, back = _parts(scene, behind)
+    near, alpha = front.render_attributes(camera, attributes)
+    far, further = back.render_attributes(camera, attributes.to(scene.device)[behind])
+    left = 1 - alpha
+    return near + left[..., None] * far, alpha + left * further
+
+
+def sides(scene: Scene) -> Float[Tensor, "n 3"] | None:
+    """Normals to the sides that were seen, zero where a Gaussian has none; None where nobody knows."""
+    if scene.facing is None:
+        return None
     normals = _normals(scene)
-    behind = facing.to(normals.dtype) * _cosines(scene, normals, camera) < -BEHIND_COSINE
-    if not bool(behind.any()):
-        return scene.render(camera, exposure=exposure)
-    gaussians = scene.gaussians
-    # Of opacity 0 they are culled, at less than it takes to copy all others.
-    opacities = torch.where(behind, -torch.inf, gaussians.opacities)
-    front = replace(scene, gaussians=replace(gaussians, opacities=opacities)).render(
-        camera, exposure=exposure
-    )
-    back = Scene(gaussians.subset(behind), scene.light).render(camera, exposure=exposure)
+    return scene.facing.to(normals.dtype)[:, None] * normals
+
+
+def seen_from_behind(
+    means: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], eye: Float[Tensor, "3"]
+) -> Bool[Tensor, "n"]:
+    """Which Gaussians a camera sees from behind.
+
+    Args:
+        means: their centres.
+        normals: to the sides that were seen, as `sides` has them.
+        eye: centre of the camera.
+    """
+    return _cosines(means, normals, eye) < -BEHIND_COSINE
+
+
+def laid_over(front: Rendering, back: Rendering) -> Rendering:
+    """Colour, opacity and expected depth of one rendering over another; radii are those of the front one."""
     left = 1 - front.alpha
     alpha = front.alpha + left * back.alpha
     distance = front.alpha * front.depth + left * back.alpha * back.depth
@@ -119,15 +167,36 @@ def one_sided_rendering(
         rgb=front.rgb + left[..., None] * back.rgb,
         alpha=alpha,
         depth=torch.where(alpha > 0, distance / alpha.clamp_min(torch.finfo(alpha.dtype).tiny), 0),
+        median_depth=None,
     )
 
 
+def _behind(scene: Scene, camera: Cameras) -> Bool[Tensor, "n"] | None:
+    """Which Gaussians one view sees from behind; None where it is none."""
+    normals = sides(scene)
+    if normals is None:
+        return None
+    behind = seen_from_behind(scene.gaussians.means.detach(), normals, scene.array(camera.centers[0]))
+    return behind if bool(behind.any()) else None
+
+
+def _parts(scene: Scene, behind: Bool[Tensor, "n"]) -> tuple[Scene, Scene]:
+    """The scene without what stands behind, of as many Gaussians, and that alone."""
+    gaussians = scene.gaussians
+    # Of opacity 0 they are culled, at less than it takes to copy all others.
+    opacities = torch.where(behind, -torch.inf, gaussians.opacities)
+    front = replace(scene, gaussians=replace(gaussians, opacities=opacities))
+    return front, Scene(gaussians.subset(behind), scene.light)
+
+
 def _normals(scene: Scene) -> Float[Tensor, "n 3"]:
+    """Shortest axes, of whatever sign."""
     gaussians = scene.gaussians
     return shortest_axes(gaussians.quats.detach(), gaussians.scales.detach())
 
 
-def _cosines(scene: Scene, normals: Float[Tensor, "n 3"], camera: Cameras) -> Float[Tensor, "n"]:
+def _cosines(
+    means: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], eye: Float[Tensor, "3"]
+) -> Float[Tensor, "n"]:
     """Cosines between normals and the directions to a camera."""
-    to_camera = scene.array(camera.centers[0]) - scene.gaussians.means.detach()
-    return (functional.normalize(to_camera, dim=1) * normals).sum(dim=1)
+    return (functional.normalize(eye - means, dim=1) * normals).sum(dim=1)

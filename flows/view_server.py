@@ -228,6 +228,9 @@ class _Viewer:
             self._on_value(layer, lambda name: self._change(layer=name))
             mix = gui.add_slider("over colour (%)", min=0, max=100, step=5, initial_value=100)
             self._on_value(mix, lambda percent: self._change(mix=percent / 100))
+            if session.renderer.scene.facing is not None:
+                one_sided = gui.add_checkbox("walls seen from behind stand back", initial_value=True)
+                self._on_value(one_sided, lambda on: self._change(one_sided=on))
             width = gui.add_slider(
                 "width (px)", min=160, max=1920, step=32, initial_value=self._width_shown()
             )

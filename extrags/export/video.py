@@ -17,6 +17,7 @@ from extrags.cameras import Cameras
 from extrags.errors import ConfigError, ExtragsError, ShapeError, StoreError
 from extrags.events import Progress, emit
 from extrags.exploration.coverage import direction_counts, training_coverage
+from extrags.facing import one_sided_attributes, one_sided_rendering
 from extrags.output_files import whole_file
 from extrags.scene import Scene
 from extrags.shown_pixels import shown_pixels
@@ -68,6 +69,9 @@ def fly_through(
 ) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
     """Render every camera of a path, one picture beside the other.
 
+    What a view sees from behind stands behind all else, as in the evaluation
+    (`extrags.facing.one_sided_rendering`).
+
     Args:
         scenes: one column each, from left to right.
         path: the flight.
@@ -93,10 +97,10 @@ def fly_through(
         columns = []
         with torch.no_grad():
             for scene in scenes if colors else ():
-                rgb = scene.render(camera, exposure=gain).rgb[0].clamp(0, 1).cpu().numpy()
+                rgb = one_sided_rendering(scene, camera, exposure=gain).rgb[0].clamp(0, 1).cpu().numpy()
                 columns.append(np.rint(rgb * 255).astype(np.uint8))
             if lacking is not None:
-                shown, alpha = scenes[-1].render_attributes(camera, lacking[:, None])
+                shown, alpha = one_sided_attributes(scenes[-1], camera, lacking[:, None])
                 # Where the scene holds nothing, nothing is known.
                 unknown = (shown[0, ..., 0] + 1 - alpha[0]).clamp(0, 1).cpu().numpy()
                 columns.append(_colored(unknown))

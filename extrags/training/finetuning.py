@@ -74,7 +74,7 @@ def finetune(
     (`extrags.facing.with_facing`).
 
     With `keep_scene` the scene's own Gaussians and its light stay as they are: only new ones in holes are
-    learned, without densification; where there are none, the scene is returned as it was given.
+    learned, without densification; where there are none, the Gaussians are returned as they were given.
 
     Args:
         scene: the coarse scene; the optimisation runs where it is, and so does the result.

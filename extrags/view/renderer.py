@@ -10,12 +10,13 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from extrags.cameras import Cameras
 from extrags.errors import ConfigError
 from extrags.export.video import unobserved
+from extrags.facing import laid_over, seen_from_behind, sides
 from extrags.raster import CameraLight, Rendering, rasterize
 from extrags.scene import NEAR, SHALLOWEST, Scene
 from extrags.view.viewpoints import overview, typical_depth
@@ -42,6 +43,8 @@ class ViewSettings:
         layer: color; alpha, how opaque; depth, from near (red) to far (blue); uncertainty, how little the
             training views say (black: well known, yellow: unknown).
         mix: share of a layer other than colour, the rest of which is colour, 0 to 1.
+        one_sided: whether Gaussians seen from behind stand behind all others
+            (`extrags.facing.one_sided_rendering`); of no matter to a scene that does not know its sides.
 
     Raises:
         ConfigError: for a value out of range.
@@ -52,6 +55,7 @@ class ViewSettings:
     falloff: bool = True
     layer: str = "color"
     mix: float = 1.0
+    one_sided: bool = True
 
     def __post_init__(self) -> None:
         if not 0 < self.exposure < math.inf:
@@ -67,9 +71,9 @@ class ViewSettings:
 class SceneRenderer:
     """Renders one scene for any number of viewers, from any thread, one picture at a time.
 
-    With the settings that hold at first a picture is exactly that of `Scene.render`, through a lens as well.
-    What `Scene.render` makes of the parameters for every picture is made once here, and lies on the device
-    that renders.
+    With the settings that hold at first a picture is exactly that of `extrags.facing.one_sided_rendering`,
+    through a lens as well; that is `Scene.render` for a scene that does not know its sides. What they make of
+    the parameters for every picture is made once here, and lies on the device that renders.
 
     One exception: a scene without light whose typical depth is below `SHALLOWEST`, which reconstruction and
     import refuse, is rendered from a hundredth of that depth on. `Scene.render` would leave surface out.
@@ -100,6 +104,8 @@ class SceneRenderer:
             self._scales = gaussians.scales.exp().to(self.device)
             self._opacities = gaussians.opacities.sigmoid().to(self.device)
             self._sh = gaussians.sh.to(self.device)
+            outward = sides(scene)
+            self._sides = None if outward is None else outward.to(self.device)
 
     @property
     def layers(self) -> tuple[str, ...]:
@@ -125,7 +131,7 @@ class SceneRenderer:
             if settings.layer == "color" or settings.mix == 0:
                 return _eight_bit(self._lit(camera, settings).rgb[0])
             if settings.layer == "uncertainty":
-                share = self._unknown(camera)
+                share = self._unknown(camera, settings)
                 color = None if settings.mix == 1 else self._lit(camera, settings).rgb[0]
             else:
                 rendering = self._lit(camera, settings)
@@ -138,27 +144,59 @@ class SceneRenderer:
             return np.asarray(np.rint(mixed).astype(np.uint8))
 
     def _lit(self, camera: Cameras, settings: ViewSettings) -> Rendering:
-        return self._rasterized(camera, self._sh, light=self._light(settings))
+        return self._rasterized(camera, settings, self._sh, light=self._light(settings))
 
     def _rasterized(
         self,
         camera: Cameras,
+        settings: ViewSettings,
         sh: Float[Tensor, "n k 3"] | None,
         *,
         colors: Float[Tensor, "n 3"] | None = None,
         light: CameraLight | None = None,
     ) -> Rendering:
+        behind = self._behind(camera) if settings.one_sided else None
+        if behind is None:
+            return self._drawn(camera, self._opacities, sh, colors, light)
+        # Of opacity 0 they are culled, at less than it takes to copy all others.
+        front = self._drawn(camera, torch.where(behind, 0, self._opacities), sh, colors, light)
+        back = self._drawn(camera, self._opacities, sh, colors, light, which=behind.nonzero()[:, 0])
+        return laid_over(front, back)
+
+    def _behind(self, camera: Cameras) -> Bool[Tensor, "n"] | None:
+        """Which Gaussians the camera sees from behind; None where it is none."""
+        if self._sides is None:
+            return None
+        eye = torch.from_numpy(camera.centers[0].astype(np.float32)).to(self.device)
+        behind = seen_from_behind(self._means, self._sides, eye)
+        return behind if bool(behind.any()) else None
+
+    def _drawn(
+        self,
+        camera: Cameras,
+        opacities: Float[Tensor, "n"],
+        sh: Float[Tensor, "n k 3"] | None,
+        colors: Float[Tensor, "n 3"] | None,
+        light: CameraLight | None,
+        *,
+        which: Int[Tensor, "m"] | None = None,
+    ) -> Rendering:
+        """Some of the Gaussians; None draws all."""
+
+        def some(values: Tensor) -> Tensor:
+            return values if which is None else values[which]
+
         return rasterize(
-            self._means,
-            self._quats,
-            self._scales,
-            self._opacities,
-            sh,
+            some(self._means),
+            some(self._quats),
+            some(self._scales),
+            some(opacities),
+            None if sh is None else some(sh),
             torch.from_numpy(camera.viewmats.astype(np.float32)).to(self.device),
             torch.from_numpy(camera.K.astype(np.float32)).to(self.device),
             camera.width,
             camera.height,
-            colors=colors,
+            colors=None if colors is None else some(colors),
             light=light,
             near=self._near,
             lens=camera.lens,
@@ -190,8 +228,8 @@ class SceneRenderer:
         }
         return replace(made, **moved)
 
-    def _unknown(self, camera: Cameras) -> Float[Tensor, "h w"]:
-        rendering = self._rasterized(camera, None, colors=self._lacking)
+    def _unknown(self, camera: Cameras, settings: ViewSettings) -> Float[Tensor, "h w"]:
+        rendering = self._rasterized(camera, settings, None, colors=self._lacking)
         # Where the scene holds nothing, nothing is known.
         return rendering.rgb[0, ..., 0] + 1 - rendering.alpha[0]
 

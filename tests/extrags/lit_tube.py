@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -10,6 +10,7 @@ import torch
 from extrags.cameras import Cameras, look_at, pixel_rays
 from extrags.gaussians import Gaussians
 from extrags.illumination import NearFieldLight
+from extrags.raster.light import shortest_axes
 from extrags.restoration.training_data.recordings import PretrainingRecording
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence, Split
@@ -127,3 +128,20 @@ def build_tube(*, enlarged: int = 1) -> Tube:
     )
     scene = Scene(gaussians, tube_light(frames - 2))
     return Tube(scene, sequence, gather_references(scene, sequence, sequence.train))
+
+
+def seen_from_inside(scene: Scene) -> Scene:
+    """The same scene, which knows that its Gaussians were seen from the axis."""
+    gaussians = scene.gaussians
+    inward = -gaussians.means * torch.tensor([1.0, 1.0, 0.0])
+    cosines = (shortest_axes(gaussians.quats, gaussians.scales) * inward).sum(dim=1)
+    return replace(scene, facing=cosines.sign().to(torch.int8))
+
+
+def from_outside() -> Cameras:
+    """A camera beside the tube that looks at its axis."""
+    camera = tube_cameras(1)
+    pose = look_at(
+        np.array([-2.5 * RADIUS_MM, 0.0, 10.0]), np.array([0.0, 0.0, 20.0]), up=np.array([0.0, -1.0, 0.0])
+    )
+    return replace(camera, world_from_camera=pose[None])

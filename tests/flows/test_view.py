@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from extrags.cameras import Cameras
 from extrags.errors import MissingDependencyError, StoreError
@@ -27,7 +28,7 @@ from flows.cli import main, parser
 from flows.commands import view as command
 from flows.outcome import SequenceOutcome
 from flows.view_server import ViewServer, check_installed
-from tests.extrags.lit_tube import build_tube, tube_cameras
+from tests.extrags.lit_tube import build_tube, from_outside, seen_from_inside, tube_cameras
 from tests.flows import viser_stand_in
 from tests.flows.tiny import SEQUENCE, TINY
 
@@ -295,6 +296,33 @@ class TestBrowser:
         assert not {"lamp (%)", "fall-off", "training view"} & set(controls)
         assert "uncertainty" not in browser.gui.options["layer"]["options"]
         stand_in.made[0].disconnect(browser)
+        server.stop()
+
+    def test_walls_stand_where_they_are_if_that_is_wanted(
+        self, client: viser_stand_in.Client, stand_in: type[viser_stand_in.ViserServer]
+    ) -> None:
+        """Where the scene knows from which side its walls were seen; the other one has no such box."""
+        box = "walls seen from behind stand back"
+        assert box not in client.gui.controls
+        server = ViewServer(SceneRenderer(seen_from_inside(build_tube().scene)), width=160)
+        browser = viser_stand_in.Client()
+        stand_in.made[-1].connect(browser)
+
+        def differs(picture: np.ndarray) -> bool:
+            """Whether the last picture is one of full resolution and another one."""
+            last = browser.pictures[-1].astype(float) if browser.pictures else picture
+            return last.shape == picture.shape and bool(np.abs(last - picture).mean() > 1)
+
+        pose = from_outside().world_from_camera[0]
+        turn = Rotation.from_matrix(pose[:3, :3]).as_quat()[[3, 0, 1, 2]]
+        browser.camera.move(wxyz=turn, position=pose[:3, 3] / 10.0)
+        # Colours are dark that far from the lamp.
+        browser.gui.controls["layer"].set("depth")
+        eventually(lambda: differs(np.zeros((120, 160, 3))))
+        through = browser.pictures[-1].astype(float)
+        browser.gui.controls[box].set(False)
+        eventually(lambda: differs(through))
+        stand_in.made[-1].disconnect(browser)
         server.stop()
 
 

@@ -10,10 +10,12 @@ from importlib.resources import files
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int8
 from markupsafe import Markup
+from torch import Tensor
 
 from extrags.config import ReportConfig
+from extrags.facing import BEHIND_COSINE
 from extrags.gaussians import Gaussians
 from extrags.illumination import NearFieldLight
 from extrags.raster.rendering import ALPHA_MIN, DILATION_PX2
@@ -53,6 +55,7 @@ class ViewerContent:
         has_virtual: whether there are virtual trajectories.
         has_free_space: whether the free space of the run is among the overlays.
         has_light: whether a scene has a light.
+        has_sides: whether a scene knows from which side its Gaussians were seen.
         unit: of lengths.
         width: of the run's images in pixels.
         height: the same for the height.
@@ -68,6 +71,7 @@ class ViewerContent:
     has_virtual: bool
     has_free_space: bool
     has_light: bool
+    has_sides: bool
     unit: str
     width: int
     height: int
@@ -105,7 +109,7 @@ def viewer_content(inputs: ReportInputs, largest_bytes: int) -> ViewerContent | 
             None if inputs.pseudo is None else inputs.pseudo.expected_error,
             masks=sequence.training_masks,
         )
-        encoded, said = encoded_within(scene.gaussians, quantities, share)
+        encoded, said = encoded_within(scene.gaussians, quantities, share, facing=scene.facing)
         element = f"viewer-{name}"
         bodies[element] = Markup(base64.b64encode(encoded.body).decode("ascii"))
         headers.append(_header(name, element, scene, encoded, quantities))
@@ -126,6 +130,7 @@ def viewer_content(inputs: ReportInputs, largest_bytes: int) -> ViewerContent | 
         "height": sequence.height,
         "near": min(scene.near for scene in scenes.values()),
         "dilation": DILATION_PX2,
+        "behind": BEHIND_COSINE,
         "distance": float(distance),
     }
     shaders = {name: str(script_text(name)) for name in SHADERS}
@@ -140,6 +145,7 @@ def viewer_content(inputs: ReportInputs, largest_bytes: int) -> ViewerContent | 
         has_virtual=bool(inputs.trajectories),
         has_free_space=data["free"] is not None,
         has_light=any(scene.light is not None for scene in scenes.values()),
+        has_sides=any(scene.facing is not None for scene in scenes.values()),
         unit=unit,
         width=sequence.width,
         height=sequence.height,
@@ -173,7 +179,11 @@ def _left_out(scenes: Mapping[str, Scene]) -> str:
 
 
 def encoded_within(
-    gaussians: Gaussians, quantities: Mapping[str, Quantity], largest_bytes: int
+    gaussians: Gaussians,
+    quantities: Mapping[str, Quantity],
+    largest_bytes: int,
+    *,
+    facing: Int8[Tensor, "n"] | None = None,
 ) -> tuple[EncodedScene, str]:
     """A scene in at most so many bytes, and in words what was left out for it.
 
@@ -181,7 +191,7 @@ def encoded_within(
     area of their two longer axes.
     """
     for degree in range(gaussians.sh_degree, -1, -1):
-        encoded = encoded_scene(gaussians, quantities, degree=degree)
+        encoded = encoded_scene(gaussians, quantities, facing=facing, degree=degree)
         if len(encoded.body) <= largest_bytes:
             cut = degree < gaussians.sh_degree
             return encoded, f"harmonics up to degree {degree} of {gaussians.sh_degree}" if cut else ""
@@ -196,7 +206,9 @@ def encoded_within(
             name: Quantity(item.values[kept], item.low, item.high, item.title, item.ends)
             for name, item in quantities.items()
         }
-        encoded = encoded_scene(gaussians.detached().subset(_index(kept)), picked, degree=0)
+        index = _index(kept)
+        sides = None if facing is None else facing[index]
+        encoded = encoded_scene(gaussians.detached().subset(index), picked, facing=sides, degree=0)
     return encoded, f"{count} of {len(gaussians)} Gaussians, without harmonics"
 
 
@@ -221,6 +233,7 @@ def _header(
         "element": element,
         "count": encoded.count,
         "degree": encoded.degree,
+        "sided": encoded.sided,
         "block": BLOCK,
         "quantities": list(encoded.quantities),
         "quantities_shown": [

@@ -5,7 +5,8 @@ order and cut into blocks of 256; each channel of a block is stored in 8 or 16 b
 the largest value it has there. Neighbours are alike, so that a centre keeps about 1e-5 of the size of its
 block and a colour about 1/500 of the range of its neighbours. Rotations drop the largest of four components
 and keep ten bits of each other one. Values known of Gaussians (the quantities) take 8 bits over a range
-common to all, 255 standing for unknown.
+common to all, 255 standing for unknown. Where a scene knows from which side its Gaussians were seen, two bits
+of each say so in a last plane; the shortest axis of a flat Gaussian stays the shortest in 8 bits.
 
 SPZ was not used: it keeps colours in steps of a fixed range made for light baked into them, which clips
 bright albedo. SOG needs a clustering for every page.
@@ -19,7 +20,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int, Int8, UInt8
+from torch import Tensor
 
 from extrags.errors import ShapeError, SourceError
 from extrags.gaussians import Gaussians
@@ -67,31 +69,40 @@ class EncodedScene:
         count: number of Gaussians.
         degree: of the spherical harmonics kept.
         quantities: names of the quantities, in the order of their planes.
+        sided: whether the sides from which the Gaussians were seen (`Scene.facing`) follow.
     """
 
     body: bytes
     count: int
     degree: int
     quantities: tuple[str, ...]
+    sided: bool = False
 
 
 def encoded_scene(
-    gaussians: Gaussians, quantities: Mapping[str, Quantity] | None = None, *, degree: int | None = None
+    gaussians: Gaussians,
+    quantities: Mapping[str, Quantity] | None = None,
+    *,
+    facing: Int8[Tensor, "n"] | None = None,
+    degree: int | None = None,
 ) -> EncodedScene:
     """Gaussians as planes of small integers; those that no picture shows (opacity below 1/255) are left out.
 
     Args:
         gaussians: the scene.
         quantities: numbers known of each Gaussian.
+        facing: sides from which the Gaussians were seen (`Scene.facing`); None where nobody knows.
         degree: highest degree of harmonics to keep; None keeps all.
 
     Raises:
-        ShapeError: when a quantity has another number of entries.
+        ShapeError: when a quantity or the sides have another number of entries.
     """
     quantities = {} if quantities is None else quantities
     for name, quantity in quantities.items():
         if quantity.values.shape != (len(gaussians),):
             raise ShapeError(f"{name} has shape {quantity.values.shape}, expected ({len(gaussians)},)")
+    if facing is not None and facing.shape != (len(gaussians),):
+        raise ShapeError(f"facing has shape {tuple(facing.shape)}, expected ({len(gaussians)},)")
     kept = min(gaussians.sh_degree, 3 if degree is None else degree)
     opacity = gaussians.opacities.detach().sigmoid().numpy()
     shown = np.flatnonzero(opacity >= ALPHA_MIN)
@@ -109,9 +120,11 @@ def encoded_scene(
         share = (quantity.values[order] - quantity.low) / max(quantity.high - quantity.low, 1e-12)
         level = np.rint(np.clip(np.nan_to_num(share), 0, 1) * (UNKNOWN - 1))
         planes.append(np.where(np.isfinite(share), level, UNKNOWN).astype(np.uint8).tobytes())
+    if facing is not None:
+        planes.append(_packed_sides(facing.cpu().numpy()[order]))
     # Without the time of day: equal scenes give equal bytes.
     body = gzip.compress(b"".join(planes), COMPRESSION, mtime=0)
-    return EncodedScene(body, len(order), kept, tuple(quantities))
+    return EncodedScene(body, len(order), kept, tuple(quantities), facing is not None)
 
 
 def faint_gaussians(gaussians: Gaussians) -> int:
@@ -119,8 +132,10 @@ def faint_gaussians(gaussians: Gaussians) -> int:
     return int((gaussians.opacities.detach().sigmoid() < ALPHA_MIN).sum())
 
 
-def decoded_scene(encoded: EncodedScene) -> tuple[Gaussians, dict[str, UInt8[np.ndarray, "n"]]]:
-    """What the viewer makes of an encoded scene: Gaussians in Morton order, and the levels of its quantities.
+def decoded_scene(
+    encoded: EncodedScene,
+) -> tuple[Gaussians, dict[str, UInt8[np.ndarray, "n"]], Int8[Tensor, "n"] | None]:
+    """What the viewer makes of an encoded scene: Gaussians in Morton order, levels of its quantities, sides.
 
     Raises:
         SourceError: when the body does not have the length its header says.
@@ -134,6 +149,7 @@ def decoded_scene(encoded: EncodedScene) -> tuple[Gaussians, dict[str, UInt8[np.
     terms = (encoded.degree + 1) ** 2
     sh = torch.from_numpy(reader.channels("sh", 3 * terms).reshape(n, terms, 3))
     quantities = {name: reader.take(n) for name in encoded.quantities}
+    facing = torch.from_numpy(_sides(reader.take(-(-n // 4)), n)) if encoded.sided else None
     if reader.at != len(raw):
         raise SourceError(f"an encoded scene has {len(raw)} bytes, expected {reader.at}")
     gaussians = Gaussians(
@@ -144,7 +160,7 @@ def decoded_scene(encoded: EncodedScene) -> tuple[Gaussians, dict[str, UInt8[np.
         sh0=sh[:, :1],
         shN=sh[:, 1:],
     )
-    return gaussians, quantities
+    return gaussians, quantities, facing
 
 
 class _Reader:
@@ -186,6 +202,17 @@ def _channel_planes(kind: str, values: Float[np.ndarray, "n c"]) -> list[bytes]:
         planes += [low.astype("<f4").tobytes(), high.astype("<f4").tobytes()]
         planes += [np.ascontiguousarray(level[:, part]).tobytes() for part in range(size)]
     return planes
+
+
+def _packed_sides(facing: Int8[np.ndarray, "n"]) -> bytes:
+    """Two bits each, 0 to 2 for -1 to 1, the first of four in the lowest bits."""
+    level = np.pad((facing + 1).astype(np.uint8), (0, -len(facing) % 4)).reshape(-1, 4)
+    return bytes(level[:, 0] | level[:, 1] << 2 | level[:, 2] << 4 | level[:, 3] << 6)
+
+
+def _sides(packed: UInt8[np.ndarray, "_"], count: int) -> Int8[np.ndarray, "n"]:
+    level = packed[:, None] >> np.arange(0, 8, 2, dtype=np.uint8) & 3
+    return level.reshape(-1)[:count].astype(np.int8) - np.int8(1)
 
 
 def _rotation_planes(quats: Float[np.ndarray, "n 4"]) -> list[bytes]:

@@ -16,8 +16,9 @@ import torch
 from extrags.errors import ConfigError, ShapeError, SourceError, StoreError
 from extrags.export import fly_through, write_video
 from extrags.export.video import unobserved
+from extrags.facing import one_sided_attributes, one_sided_rendering
 from extrags.scene import Scene
-from tests.extrags.lit_tube import Tube
+from tests.extrags.lit_tube import Tube, from_outside, seen_from_inside
 
 
 def decoded(file: Path) -> list[np.ndarray]:
@@ -97,6 +98,24 @@ def test_beyond_the_edge_of_the_picture_nothing_was_seen(tube: Tube) -> None:
     (masked,) = fly_through([tube.scene], path, train=train, masks=[none] * len(train), colors=False)
     (known,) = fly_through([tube.scene], path, train=train, colors=False)
     assert masked.mean() > known.mean() + 20
+
+
+def test_walls_seen_from_behind_stand_back(tube: Tube) -> None:
+    """From outside, the picture is that of the evaluation, and what is not known that of the same walls."""
+    scene, path, train = seen_from_inside(tube.scene), from_outside(), tube.sequence.training_cameras
+    (shown,) = fly_through([scene], path, exposure=4.0, train=train)
+    with torch.no_grad():
+        expected = one_sided_rendering(scene, path, exposure=torch.tensor([4.0]))
+    color = expected.rgb[0].clamp(0, 1).numpy()
+    np.testing.assert_allclose(shown[:, :64] / 255, color, atol=0.5 / 255 + 1e-6)
+    (plain,) = fly_through([tube.scene], path, exposure=4.0, train=train)
+    for column in (slice(0, 64), slice(64, 128)):
+        assert np.abs(shown[:, column].astype(float) - plain[:, column]).mean() > 5
+    depth = scene.gaussians.means.matmul(torch.from_numpy(path.viewmats[0, 2, :3]).float())
+    depth = depth + float(path.viewmats[0, 2, 3])
+    sums, alpha = one_sided_attributes(scene, path, depth[:, None])
+    torch.testing.assert_close(alpha, expected.alpha)
+    torch.testing.assert_close(sums[..., 0], expected.alpha * expected.depth, rtol=1e-3, atol=1e-2)
 
 
 @pytest.mark.usefixtures("without_kernels")

@@ -14,12 +14,13 @@ import torch
 from extrags.cameras import Cameras
 from extrags.errors import ConfigError
 from extrags.export import fly_through
+from extrags.facing import one_sided_rendering
 from extrags.gaussians import Gaussians
 from extrags.radial_lens import RadialLens
 from extrags.raster import available_backends
 from extrags.scene import Scene
 from extrags.view import SceneRenderer, ViewSettings, overview, pinhole, renderer, typical_depth
-from tests.extrags.lit_tube import build_tube, tube_cameras
+from tests.extrags.lit_tube import build_tube, from_outside, seen_from_inside, tube_cameras
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +56,27 @@ def test_pictures_through_a_lens_are_those_of_the_scene(scene: Scene, camera: Ca
     made = SceneRenderer(scene).render(through, ViewSettings())
     np.testing.assert_array_equal(made, rendered(scene, through))
     assert np.abs(made.astype(int) - rendered(scene, camera).astype(int)).max() > 20
+
+
+def test_walls_seen_from_behind_stand_back(scene: Scene) -> None:
+    """Exactly as in the evaluation, in every layer; where they stand if that is wanted."""
+    sided, camera = seen_from_inside(scene), from_outside()
+    made = SceneRenderer(sided, train=tube_cameras(6))
+    with torch.no_grad():
+        expected = one_sided_rendering(sided, camera, exposure=torch.tensor([4.0]))
+    picture = np.rint(expected.rgb[0].clamp(0, 1).numpy() * 255).astype(np.uint8)
+    np.testing.assert_array_equal(made.render(camera, ViewSettings(exposure=4.0)), picture)
+    where_they_stand = made.render(camera, ViewSettings(exposure=4.0, one_sided=False))
+    np.testing.assert_array_equal(where_they_stand, rendered(scene, camera, 4.0))
+    assert np.abs(where_they_stand.astype(int) - picture).mean() > 5
+    alpha = made.render(camera, ViewSettings(layer="alpha"))[..., 0]
+    np.testing.assert_array_equal(alpha, np.rint(expected.alpha[0].clamp(0, 1).numpy() * 255))
+    for layer in ("depth", "uncertainty"):
+        shown, plain = (
+            made.render(camera, ViewSettings(layer=layer, one_sided=one_sided)).astype(int)
+            for one_sided in (True, False)
+        )
+        assert np.abs(shown - plain).mean() > 2, layer
 
 
 def test_a_scene_of_a_small_unit_without_light_shows_its_near_surface(camera: Cameras, scene: Scene) -> None:

@@ -61,6 +61,7 @@ function connected(viewer) {
     i: () => viewer.look(0, 0.06), k: () => viewer.look(0, -0.06),
     "+": () => viewer.move([0, 0, 0.06]), "-": () => viewer.move([0, 0, -0.06]),
     f: () => toggled("free"), x: () => toggled("slice"),
+    b: () => viewer.scene.sided && viewer.show("one_sided", !viewer.shown.one_sided),
     "[": () => slid(1 / 1.1), "]": () => slid(1.1),
     n: () => neighbour(1), p: () => neighbour(-1), Home: () => viewer.jump(0, 0), " ": () => part("play").click(),
   };
@@ -166,6 +167,8 @@ function connected(viewer) {
       cut.value = viewer.sliceDepth;
       cut.nextElementSibling.textContent = viewer.sliceDepth.toPrecision(3);
     }
+    const sided = root.querySelector('[data-show="one_sided"]');
+    if (sided) sided.disabled = !viewer.scene.sided;
     part("lit").checked = light.on;
     part("lit").disabled = !viewer.scene.light;
     part("pinned").checked = Boolean(viewer.lampPose);

@@ -5,6 +5,14 @@ async function inflated(text) {
   return new Uint8Array(await new Response(stream).arrayBuffer());
 }
 
+// Axis of the smallest of three scales, the first of equals: a column of the rotation.
+function shortestAxis([w, x, y, z], scales, at) {
+  const [a, b, c] = [scales[at], scales[at + 1], scales[at + 2]];
+  if (a <= b && a <= c) return [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)];
+  if (b <= c) return [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)];
+  return [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)];
+}
+
 async function decodedScene(header) {
   const raw = await inflated(document.getElementById(header.element).textContent);
   const n = header.count, blocks = Math.ceil(n / header.block);
@@ -27,9 +35,12 @@ async function decodedScene(header) {
   const scales = channels(3, 1), [opacity] = channels(1, 1);
   const terms = (header.degree + 1) ** 2, sh = channels(3 * terms, 1);
   const levels = header.quantities.map(() => take(n));
+  const packed = header.sided ? take(Math.ceil(n / 4)) : null;
 
   const means = new Float32Array(3 * n), geometry = new Float32Array(12 * n);
   const harmonics = new Float32Array(4 * terms * n), quantities = new Uint8Array(4 * n);
+  // Normals to the side from which a Gaussian was seen; zero where it has no sides.
+  const sides = packed && new Float32Array(3 * n);
   const rest = [0, 0, 0];
   for (let i = 0; i < n; i += 1) {
     means.set([x[i], y[i], z[i]], 3 * i);
@@ -43,7 +54,9 @@ async function decodedScene(header) {
     for (let k = 0; k < terms; k += 1) {
       for (let c = 0; c < 3; c += 1) harmonics[4 * (terms * i + k) + c] = sh[3 * k + c][i];
     }
+    const side = packed ? ((packed[i >> 2] >> (2 * (i & 3))) & 3) - 1 : 0;
+    if (side) sides.set(shortestAxis(q, geometry, 12 * i + 8).map((value) => side * value), 3 * i);
     for (let k = 0; k < levels.length; k += 1) quantities[4 * i + k] = levels[k][i];
   }
-  return { ...header, terms, means, geometry, harmonics, quantities };
+  return { ...header, terms, means, sides, geometry, harmonics, quantities };
 }

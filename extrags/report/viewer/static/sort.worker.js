@@ -1,16 +1,25 @@
 // Order of the Gaussians of each scene from the farthest to the nearest, by z-depth: a radix sort of its bits.
+// What the eye sees from behind comes before all else: extrags/facing.py.
 "use strict";
 const places = {};
-function sorted(means, row, near) {
+function sorted({ means, sides }, { row, near, eye, behind }) {
   const n = means.length / 3;
   const keys = new Uint32Array(n), ids = new Uint32Array(n);
   const depth = new Float32Array(1), bits = new Uint32Array(depth.buffer);
+  const sided = Boolean(sides && eye), limit = -behind * behind;
   let count = 0;
   for (let i = 0; i < n; i += 1) {
     depth[0] = row[0] * means[3 * i] + row[1] * means[3 * i + 1] + row[2] * means[3 * i + 2] + row[3];
     if (depth[0] < near) continue;
     // Positive floats are ordered as their bits are; turned round, so that the farthest comes first.
-    keys[count] = ~bits[0];
+    let key = ~bits[0];
+    if (sided) {
+      const x = eye[0] - means[3 * i], y = eye[1] - means[3 * i + 1], z = eye[2] - means[3 * i + 2];
+      const along = sides[3 * i] * x + sides[3 * i + 1] * y + sides[3 * i + 2] * z;
+      // The highest bit, set in all of these keys, tells the two apart.
+      if (along * Math.abs(along) < limit * (x * x + y * y + z * z)) key &= 0x7fffffff;
+    }
+    keys[count] = key;
     ids[count] = i;
     count += 1;
   }
@@ -30,10 +39,10 @@ function sorted(means, row, near) {
 }
 function answer(message) {
   if (message.means) {
-    places[message.scene] = message.means;
+    places[message.scene] = { means: message.means, sides: message.sides };
     return null;
   }
-  return { ...message, order: sorted(places[message.scene], message.row, message.near) };
+  return { ...message, order: sorted(places[message.scene], message) };
 }
 if (typeof WorkerGlobalScope !== "undefined") {
   self.onmessage = (event) => {

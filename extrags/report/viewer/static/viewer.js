@@ -18,7 +18,7 @@ class Viewer {
     this.light = null;
     this.lampPose = null;
     this.quantity = "";
-    this.shown = { train: false, held_out: false, virtual: false, mesh: false, free: false, slice: false };
+    this.shown = { train: false, held_out: false, virtual: false, mesh: false, free: false, slice: false, one_sided: true };
     this.shapes = {};
     this.clearance = null;
     this.sliceDepth = data.distance;
@@ -37,7 +37,8 @@ class Viewer {
   async load() {
     for (const header of this.data.scenes) {
       const scene = await decodedScene(header);
-      this.worker.postMessage({ scene: scene.name, means: scene.means });
+      this.worker.postMessage({ scene: scene.name, means: scene.means, sides: scene.sides });
+      scene.sides = null;
       this.renderer.upload(scene);
       this.scenes[scene.name] = scene;
     }
@@ -222,7 +223,10 @@ class Viewer {
     this.waiting = [];
     const view = viewMatrix(this.pose);
     this.pending = { name: this.name };
-    this.worker.postMessage({ scene: this.name, near: this.data.near, row: [view[2], view[6], view[10], view[14]] });
+    this.worker.postMessage({
+      scene: this.name, near: this.data.near, row: [view[2], view[6], view[10], view[14]],
+      behind: this.data.behind, eye: this.shown.one_sided ? column(this.pose, 3) : null,
+    });
   }
 
   sorted({ scene, order }) {

@@ -11,6 +11,7 @@ import torch
 from extrags.cameras import Cameras, pixel_rays
 from extrags.gaussians import Gaussians
 from extrags.illumination import NearFieldLight
+from extrags.raster.light import shortest_axes
 from extrags.report import ReportInputs
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
@@ -54,6 +55,10 @@ def virtual_cameras(sequence: EndoscopicSequence) -> Cameras:
 
 @pytest.fixture(scope="session")
 def drawn(inputs: ReportInputs, scene: Scene, virtual_cameras: Cameras) -> ReportInputs:
-    """The inputs of a report with both scenes; the final one has lost some Gaussians."""
-    final = Scene(scene.gaussians.subset(torch.arange(0, len(scene.gaussians), 2)), scene.light)
+    """The inputs of a report with both scenes; the final one has lost some Gaussians, and knows its sides."""
+    kept = scene.gaussians.subset(torch.arange(0, len(scene.gaussians), 2))
+    inward = -kept.means * torch.tensor([0, 1, 1])
+    facing = (shortest_axes(kept.quats, kept.scales) * inward).sum(dim=1).sign().to(torch.int8)
+    facing[::7] = 0
+    final = Scene(kept, scene.light, facing)
     return replace(inputs, coarse_scene=scene, final_scene=final, virtual_cameras=virtual_cameras)

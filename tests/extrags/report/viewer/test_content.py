@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from extrags.config import PipelineConfig, ReportConfig
 from extrags.redaction import has_credentials
@@ -49,8 +50,13 @@ def test_scenes_in_the_page_are_those_of_the_run(html: str, drawn: ReportInputs)
     for header, scene in zip(data["scenes"], (drawn.coarse_scene, drawn.final_scene), strict=True):
         body = base64.b64decode(re.search(rf'id="{header["element"]}">(.*?)</script>', html)[1])
         quantities = tuple(header["quantities"])
-        found, levels = decoded_scene(EncodedScene(body, header["count"], header["degree"], quantities))
+        encoded = EncodedScene(body, header["count"], header["degree"], quantities, header["sided"])
+        found, levels, facing = decoded_scene(encoded)
         assert len(found) == len(scene.gaussians)
+        if scene.facing is None:
+            assert facing is None
+        else:
+            assert torch.equal(facing.sort().values, scene.facing.sort().values)
         assert set(levels) == {"observed", "directions", "uncertainty", "expected_error"}
         assert header["light"]["reference"] == 12.0
         assert np.allclose(header["light"]["offset"], [0.1, -0.05, 0])
@@ -98,6 +104,32 @@ def test_budget(scene: Scene) -> None:
     assert len(least.body) <= 8000
     assert 200 < least.count < len(gaussians)
     assert said.startswith(f"{least.count} of {len(gaussians)} Gaussians")
+
+
+def test_sides_stay_with_the_gaussians_that_are_kept(scene: Scene) -> None:
+    """Those that show most are kept; here they are the ones with sides."""
+    gaussians = scene.gaussians
+    large = torch.arange(len(gaussians)) % 2 == 0
+    solid = replace(
+        gaussians,
+        opacities=torch.where(large, 5.0, -4.0),
+        scales=gaussians.scales + torch.where(large, 2.0, -2.0)[:, None],
+    )
+    cut, _ = encoded_within(solid, {}, 8000, facing=large.to(torch.int8))
+    facing = decoded_scene(cut)[2]
+    assert facing is not None
+    assert cut.count < int(large.sum())
+    assert (facing == 1).all()
+
+
+def test_the_switch_is_there_where_a_scene_knows_its_sides(drawn: ReportInputs) -> None:
+    switch = '<input type="checkbox" data-show="one_sided"'
+    html = build_report(drawn, CONFIG)
+    assert switch in html
+    assert "B whether walls seen from behind stand back" in html
+    neither = build_report(replace(drawn, final_scene=replace(drawn.final_scene, facing=None)), CONFIG)
+    assert switch not in neither
+    assert "seen from behind" not in Page(neither).text
 
 
 def test_page_keeps_to_its_budget(drawn: ReportInputs) -> None:

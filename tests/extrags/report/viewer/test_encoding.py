@@ -10,7 +10,9 @@ import torch
 
 from extrags.cameras import Cameras
 from extrags.errors import ShapeError, SourceError
+from extrags.facing import FLAT
 from extrags.gaussians import Gaussians
+from extrags.raster.light import shortest_axes
 from extrags.raster.rotations import rotation_matrices
 from extrags.report.viewer.encoding import Quantity, decoded_scene, encoded_scene
 from extrags.scene import Scene
@@ -27,7 +29,7 @@ def nearest(gaussians: Gaussians, other: Gaussians) -> np.ndarray:
 
 
 def test_every_parameter_comes_back(scene: Scene) -> None:
-    found, _ = decoded_scene(encoded_scene(scene.gaussians))
+    found, _, _ = decoded_scene(encoded_scene(scene.gaussians))
     assert len(found) == len(scene.gaussians)
     true = scene.gaussians.subset(torch.from_numpy(nearest(found, scene.gaussians)))
     assert (found.means - true.means).abs().max() < 1e-3
@@ -40,7 +42,7 @@ def test_every_parameter_comes_back(scene: Scene) -> None:
 
 
 def test_pictures_stay_the_same(scene: Scene, virtual_cameras: Cameras) -> None:
-    found, _ = decoded_scene(encoded_scene(scene.gaussians))
+    found, _, _ = decoded_scene(encoded_scene(scene.gaussians))
     before = scene.render(virtual_cameras[:3]).rgb
     after = Scene(found, scene.light).render(virtual_cameras[:3]).rgb
     assert 10 * torch.log10(1 / (before - after).square().mean()) > 50
@@ -61,11 +63,50 @@ def test_the_order_does_not_matter(scene: Scene) -> None:
 def test_quantities_follow_their_gaussians(scene: Scene) -> None:
     values = np.linspace(-1, 3, len(scene.gaussians))
     values[::5] = np.nan
-    found, levels = decoded_scene(encoded_scene(scene.gaussians, {"one": quantity(values)}))
+    found, levels, _ = decoded_scene(encoded_scene(scene.gaussians, {"one": quantity(values)}))
     expected = values[nearest(found, scene.gaussians)]
     assert (levels["one"][np.isnan(expected)] == 255).all()
     known = np.isfinite(expected)
     assert np.abs(levels["one"][known] / 254 * 2 - np.clip(expected[known], 0, 2)).max() <= 1 / 254 + 1e-9
+
+
+@pytest.mark.parametrize("count", [0, 1, 3, 256, 1023])
+def test_sides_follow_their_gaussians(scene: Scene, count: int) -> None:
+    few = scene.gaussians.subset(torch.arange(count))
+    sides = torch.randint(-1, 2, (count,), generator=torch.Generator().manual_seed(1), dtype=torch.int8)
+    encoded = encoded_scene(few, {"one": quantity(np.zeros(count))}, facing=sides)
+    found, levels, facing = decoded_scene(encoded)
+    assert facing is not None
+    assert facing.dtype == torch.int8
+    if count:
+        assert torch.equal(facing, sides[torch.from_numpy(nearest(found, few))])
+    assert (levels["one"] == 0).all()
+    assert encoded.sided
+
+
+def test_normals_keep_their_sign(scene: Scene) -> None:
+    """The sides are of no use where rounding to 8 bits takes another axis for the shortest."""
+    found, _, _ = decoded_scene(encoded_scene(scene.gaussians))
+    true = scene.gaussians.subset(torch.from_numpy(nearest(found, scene.gaussians)))
+    cosines = (shortest_axes(found.quats, found.scales) * shortest_axes(true.quats, true.scales)).sum(dim=1)
+    ordered = true.scales.exp().sort(dim=1).values
+    flat = ordered[:, 0] < FLAT * ordered[:, 1]
+    assert flat.float().mean() > 0.3
+    assert cosines[flat].min() > 0.99
+
+
+def test_sides_take_a_quarter_of_a_byte(scene: Scene) -> None:
+    count = len(scene.gaussians)
+    sides = torch.randint(-1, 2, (count,), generator=torch.Generator().manual_seed(1), dtype=torch.int8)
+    plain, sided = encoded_scene(scene.gaussians), encoded_scene(scene.gaussians, facing=sides)
+    assert not plain.sided
+    assert decoded_scene(plain)[2] is None
+    assert len(sided.body) - len(plain.body) < 0.26 * count
+
+
+def test_sides_of_another_number_are_refused(scene: Scene) -> None:
+    with pytest.raises(ShapeError, match=r"facing has shape \(3,\)"):
+        encoded_scene(scene.gaussians, facing=torch.zeros(3, dtype=torch.int8))
 
 
 def test_what_no_picture_shows_is_left_out(scene: Scene) -> None:
@@ -76,14 +117,14 @@ def test_what_no_picture_shows_is_left_out(scene: Scene) -> None:
 
 def test_a_rotation_of_length_zero_is_none(scene: Scene) -> None:
     one = scene.gaussians.subset(torch.arange(1))
-    found, _ = decoded_scene(encoded_scene(replace(one, quats=torch.zeros(1, 4))))
+    found, _, _ = decoded_scene(encoded_scene(replace(one, quats=torch.zeros(1, 4))))
     assert found.quats[0].tolist() == pytest.approx([1, 0, 0, 0], abs=1e-3)
 
 
 @pytest.mark.parametrize("count", [0, 1, 256, 257])
 def test_few_gaussians(scene: Scene, count: int) -> None:
     few = scene.gaussians.subset(torch.arange(count))
-    found, _ = decoded_scene(encoded_scene(few))
+    found, _, _ = decoded_scene(encoded_scene(few))
     assert len(found) == count
     assert np.allclose(np.sort(found.means, axis=0), np.sort(few.means, axis=0), atol=1e-3)
 

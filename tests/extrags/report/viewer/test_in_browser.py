@@ -13,11 +13,13 @@ import torch
 from PIL import Image
 from torch.nn import functional
 
-from extrags.cameras import pixel_rays
+from extrags.cameras import Cameras, look_at, pixel_rays
 from extrags.config import ReportConfig
+from extrags.facing import one_sided_rendering
 from extrags.raster.light import apply_response, light_gain, shortest_axes, specular_gain
 from extrags.raster.spherical_harmonics import sh_basis
 from extrags.report import ReportInputs, build_report
+from extrags.sequence import EndoscopicSequence
 from tests.browser import Browser, browser
 
 pytestmark = pytest.mark.slow
@@ -82,6 +84,59 @@ def test_training_cameras_have_their_own_exposure(tab: Browser, drawn: ReportInp
     own = scene.render(camera, exposure=scene.light.exposures()[4:5]).rgb[0].clamp(0, 1).numpy()
     mean = scene.render(camera).rgb[0].clamp(0, 1).numpy()
     assert psnr(picture(tab), own) >= 45 > psnr(picture(tab), mean)
+
+
+def outside(sequence: EndoscopicSequence) -> Cameras:
+    """A camera beside the tube that looks at its axis."""
+    middle = np.median(sequence.cameras.centers, axis=0) * [1, 0, 0]
+    pose = look_at(
+        middle + np.array([6, -30, 18]), middle + np.array([12, 0, 0]), up=np.array([0.0, 0.0, 1.0])
+    )
+    return replace(sequence.cameras[int(sequence.train[0])], world_from_camera=pose[None])
+
+
+def test_walls_seen_from_behind_stand_back(tab: Browser, drawn: ReportInputs) -> None:
+    """As in `extrags.facing`, and unlike the rasteriser where the switch is off."""
+    scene, camera = drawn.final_scene, outside(drawn.sequence)
+    exposure = torch.tensor([6.0])
+    expected, plain = (
+        rendering.rgb[0].clamp(0, 1).numpy()
+        for rendering in (
+            one_sided_rendering(scene, camera, exposure=exposure),
+            scene.render(camera, exposure=exposure),
+        )
+    )
+    assert psnr(expected, plain) < 30
+    do(tab, "setScene('final')")
+    do(tab, "jump(0, 0)")
+    tab.run(f"{VIEWER}.pose = {camera.world_from_camera[0, :3].ravel().tolist()}, true")
+    do(tab, "left()")
+    do(tab, "setLight({exposure: 6})")
+    assert psnr(picture(tab), expected) >= 45
+    do(tab, "show('one_sided', false)")
+    assert psnr(picture(tab), plain) >= 45
+    do(tab, "show('one_sided', true)")
+    assert psnr(picture(tab), expected) >= 45
+    do(tab, "resetLight()")
+
+
+def test_the_switch_of_sides(tab: Browser) -> None:
+    """By key and by box; at rest where the scene shown knows no sides."""
+    box = "document.querySelector('#viewer [data-show=one_sided]')"
+    shown = f"{VIEWER}.shown.one_sided"
+    do(tab, "setScene('final')")
+    assert tab.run(f"{box}.checked && !{box}.disabled && {shown}")
+    tab.run("document.querySelector('#viewer canvas').focus()")
+    tab.key("b")
+    assert not tab.run(f"{box}.checked || {shown}")
+    tab.run(f"{box}.click()")
+    assert tab.run(f"{box}.checked && {shown}")
+    do(tab, "setScene('coarse')")
+    assert tab.run(f"{box}.disabled")
+    tab.run("document.querySelector('#viewer canvas').focus()")
+    tab.key("b")
+    assert tab.run(shown)
+    do(tab, "setScene('final')")
 
 
 def test_the_light_moves(tab: Browser, drawn: ReportInputs) -> None:
