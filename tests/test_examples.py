@@ -8,10 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import pytest
 from PIL import Image
 
 import extrags
+from data_catalog.phantom.config import PhantomConfig
 from extrags.events import Event, subscribed
 from extrags.metrics.registry import unregister_metric
 from extrags.restoration import backends
@@ -19,6 +21,8 @@ from tests.flows.tiny import GIVEN, SEQUENCE, spared, tiny_config
 
 FAST = tiny_config(enhance__pretrained_weights="bundled", enhance__train_iterations=0, enhance__judge=False)
 """The bundled restorer as it is, neither trained nor judged on the scene."""
+
+SCENE = int(SEQUENCE.split("/")[1].split("@")[0])
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 
@@ -76,6 +80,20 @@ def test_frames_to_flythrough(tmp_path: Path) -> None:
     with Image.open(tmp_path / "way.gif") as image:
         assert image.size == (48, 40)
         assert image.n_frames == 5
+
+
+def test_video_of_a_phantom(tmp_path: Path) -> None:
+    """It is read as any video, and shows the colon of that number."""
+    module = example("video_of_a_phantom")
+    file = tmp_path / "recordings" / "exam.mp4"
+    config = PhantomConfig(width=48, height=40, video_frames=24, supersample=1)
+    module.main(file, SCENE, config)
+    read = extrags.read(str(file), extrags.PROFILES["quick"].ingest)
+    assert read.rgb.shape[1:] == (40, 48, 3)
+    truth = extrags.read(SEQUENCE, FAST.ingest)
+    # Frames of one passage through one colon: the same light and tissue in the mean.
+    shown = truth.rgb[truth.train].mean(axis=(0, 1, 2))
+    np.testing.assert_allclose(read.rgb.mean(axis=(0, 1, 2)), shown, rtol=0.1)
 
 
 def test_explore_a_ply(finished: tuple[extrags.Result, Path], tmp_path: Path) -> None:
