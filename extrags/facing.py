@@ -64,7 +64,8 @@ def with_facing(scene: Scene, cameras: Iterable[Cameras]) -> Scene:
 
     Args:
         scene: the scene, rendered where it is.
-        cameras: batches of views that the scene was made from, training and virtual ones.
+        cameras: batches of views that the scene was made from, training and virtual ones; all their pixels
+            count, those outside of masks as well.
     """
     gaussians = scene.gaussians
     normals = _normals(scene)

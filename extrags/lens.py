@@ -517,7 +517,9 @@ def left_out_share(lens: Lens, plan: Undistortion, picture: Float[np.ndarray, "h
         cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_REPLICATE,
     )
-    return 1 - float((source_areas(plan.u, plan.v) * plan.valid * found).sum()) / total
+    # Where a lens shows nothing of a direction, its map may be NaN, and so is what is found there.
+    shown = np.where(plan.valid, source_areas(plan.u, plan.v) * found, 0)
+    return 1 - float(shown.sum()) / total
 
 
 def source_areas(u: Float[np.ndarray, "h w"], v: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:

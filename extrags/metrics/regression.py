@@ -193,7 +193,7 @@ def compare_results(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict
         raise ConfigError("the two results have no method, budget, sequence and size of images in common")
     same = same_machine(before.get("machine") or {}, after.get("machine") or {})
     protocols = [_protocol(document) for document in (before, after)]
-    sharing = [document.get("sharing") for document in (before, after)]
+    sharing = [_shares_stages(document) for document in (before, after)]
     same_sharing = None in sharing or sharing[0] == sharing[1]
     one_protocol = None in protocols or protocols[0] == protocols[1]
     rows: list[_Row] = []
@@ -231,6 +231,15 @@ def compare_results(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict
             if row.primary and row.verdict == "not judged" and row.worsening >= MATTERS[row.kind]
         ],
     }
+
+
+def _shares_stages(document: Mapping[str, Any]) -> bool | None:
+    """Whether a grid's runs made common stages once; None for results that do not say."""
+    if isinstance(document.get("separate"), bool):
+        return not document["separate"]
+    # Earlier grids have it in words alone.
+    sharing = document.get("sharing")
+    return None if sharing is None else not str(sharing).startswith("none")
 
 
 def _protocol(document: Mapping[str, Any]) -> int | None:
@@ -336,7 +345,7 @@ def _other_settings(
         # Earlier results have words alone; those of a method may be worded anew, those of a variant say
         # what it changes.
         differs = (all(" = " in words for words in variants) and variants[0] != variants[1]) or (
-            all(given) and given[0] != given[1]
+            None not in given and given[0] != given[1]
         )
     else:
         differs = asked[0] != asked[1]
@@ -346,14 +355,14 @@ def _other_settings(
     return f"{_label(group)} was asked for with other settings{': ' if told else ''}{'; '.join(told)}"
 
 
-def _given(runs: Sequence[Mapping[str, Any]]) -> str:
-    """Settings that were given beside the profile, in words; empty where it is not known."""
+def _given(runs: Sequence[Mapping[str, Any]]) -> str | None:
+    """Settings that were given beside the profile, in words; None where it is not known."""
     found = {
         ", ".join(f"{name} = {value}" for name, value in sorted(run["settings"].items()))
         for run in runs
         if isinstance(run.get("settings"), Mapping)
     }
-    return " or ".join(sorted(found))
+    return " or ".join(sorted(found)) if found else None
 
 
 def _new_failure(was: Sequence[Mapping[str, Any]], now: Sequence[Mapping[str, Any]]) -> str | None:

@@ -238,7 +238,10 @@ class UrlBackend:
         place = f"{self.prefix}/{DAMAGED}"
         names = sorted(name for name, _ in self._children(place))
         if names and not dry_run:
-            self._remove_all(place)
+            try:
+                self._remove_all(place)
+            except StoreError as error:
+                return [], [error]
         return [f"{DAMAGED}/{name}" for name in names], []
 
     def _copy_of(self, manifest: Manifest) -> Path:

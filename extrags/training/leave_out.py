@@ -14,6 +14,7 @@ from torch import Tensor
 
 from extrags.config import CoarseConfig
 from extrags.errors import CaptureError
+from extrags.facing import with_facing
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
 from extrags.training.frame_weights import FrameWeights, weighted_views
@@ -124,7 +125,9 @@ def partial_scene(
         schedule = replace(schedule, normals=NormalTerm.at(start.means.numpy(), brief, iterations))
     footprint = smallest_footprint(coarse, sequence.cameras[kept])
     begin = Scene(start.to(scene.device), light)
-    return optimise(begin, lambda _: views[next(order)], schedule, footprint=footprint).scene
+    found = optimise(begin, lambda _: views[next(order)], schedule, footprint=footprint).scene
+    # What is made of it knows its sides, and is compared with it.
+    return with_facing(found, [sequence.cameras[kept]]) if coarse.one_sided else found
 
 
 def log_exposures(

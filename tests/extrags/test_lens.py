@@ -8,7 +8,7 @@ import PIL.Image  # noqa: F401  (the same)
 import pytest
 
 from extrags.errors import SourceError
-from extrags.lens import LENS_PARAMETERS, Lens, Undistortion, sample_depth
+from extrags.lens import LENS_PARAMETERS, Lens, Undistortion, left_out_share, sample_depth
 
 WIDTH, HEIGHT = 160, 128
 DISTORTION = {
@@ -191,3 +191,12 @@ def test_impossible_lenses(model, parameters, message) -> None:
 def test_a_constant_depth_stays_however_large(value) -> None:
     where = np.array([-1e9, 0.0, 1.3, 1e9])
     np.testing.assert_allclose(sample_depth(np.full((3, 4), value), where, where), value, rtol=1e-6)
+
+
+def test_what_the_pinhole_leaves_out_is_told_where_the_lens_has_no_pixel_for_some_of_it() -> None:
+    """Directions beyond the lens have no place in the source: it was said to leave out nan %."""
+    lens = Lens("SIMPLE_DIVISION", (100.0, 80.0, 64.0, 0.6), 160, 128)
+    plan = Undistortion.planned(lens)
+    assert not np.isfinite(plan.u[~plan.valid]).all()
+    share = left_out_share(lens, plan, np.ones((128, 160), dtype=np.float32))
+    assert 0 <= share < 1

@@ -58,7 +58,7 @@ BEGINNING = "beginning"
 """Name in a checkpoint of how its training began."""
 UNKNOWN = "unknown"
 """Stands for what a checkpoint of an earlier version does not say."""
-MAY_CHANGE = ("iterations", "device", "drawing_processes", "most_seconds", "checkpoint_seconds")
+MAY_CHANGE = ("iterations", "scenes", "device", "drawing_processes", "most_seconds", "checkpoint_seconds")
 """Settings that a training which goes on may have otherwise than the one that wrote its checkpoint."""
 
 logger = logging.getLogger(__name__)

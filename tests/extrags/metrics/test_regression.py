@@ -326,13 +326,30 @@ class TestWhatIsNotAlike:
 
     def test_memory_of_shared_stages_is_not_that_of_separate_ones(self) -> None:
         before, after = (self.asked(result(), peak_mib=peak) for peak in (500.0, 900.0))
-        shared, separate = {"sharing": "once"}, {"sharing": "none"}
+        shared, separate = {"sharing": "once"}, {"sharing": "none: a store for each cell"}
         found = compare_results(before | shared, after | separate)
         assert (found["times_judged"], found["memory_judged"]) == (True, False)
         assert "peak_mib" not in verdicts(found)
         assert "seconds" in verdicts(found)
         assert verdicts(compare_results(before | shared, after | shared))["peak_mib"] == "worse"
         assert verdicts(compare_results(before, after | shared))["peak_mib"] == "worse"
+        # However the words for it have changed.
+        reworded = {"sharing": "stages that runs have in common are made once", "separate": False}
+        assert verdicts(compare_results(before | shared, after | reworded))["peak_mib"] == "worse"
+        assert not compare_results(before | separate, after | reworded)["memory_judged"]
+
+    def test_settings_given_to_one_grid_alone_are_told(self) -> None:
+        def with_settings(settings: dict[str, Any]) -> dict[str, Any]:
+            found = result()
+            for case in found["cases"]:
+                case["settings"] = settings
+            return found
+
+        plain, changed = with_settings({}), with_settings({"enhance.samples": 4})
+        (line,) = compare_results(plain, changed)["other_settings"]
+        assert line.endswith("nothing, now enhance.samples = 4")
+        assert compare_results(plain, with_settings({}))["other_settings"] == []
+        assert compare_results(result(), changed)["other_settings"] == []
 
 
 def test_runs_that_fail_now_are_a_regression() -> None:
