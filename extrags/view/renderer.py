@@ -104,8 +104,8 @@ class SceneRenderer:
             self._scales = gaussians.scales.exp().to(self.device)
             self._opacities = gaussians.opacities.sigmoid().to(self.device)
             self._sh = gaussians.sh.to(self.device)
-            outward = sides(scene)
-            self._sides = None if outward is None else outward.to(self.device)
+            normals = sides(scene)
+            self._sides = None if normals is None else normals.to(self.device)
 
     @property
     def layers(self) -> tuple[str, ...]:

@@ -27,6 +27,7 @@ from extrags.errors import ConfigError, DamagedArtefactError, MissingDependencyE
 from extrags.store import MANIFEST, Manifest, Ref, Store, canonical, content_digest, digest_of
 from extrags.store.directory import held_directories
 from extrags.store.integrity import Examinable
+from tests.extrags.sweeping import swept_by_other_first
 from tests.other_user import give_to_another_user
 
 plain = st.recursive(
@@ -582,16 +583,7 @@ class TestUrl:
         for name in ("toy-v1-bb/one", "toy-v1-bb/two", "toy-v1-cc/one"):
             backend.fs.makedirs(f"{backend.prefix}/{name}", exist_ok=True)
             backend.fs.pipe_file(f"{backend.prefix}/{name}/half", b"x")
-        call, swept = getattr(backend.fs, moment), []
-
-        def other_first(*args: Any, **options: Any) -> Any:
-            listed = call(*args, **options) if moment == "find" else None
-            if not swept:
-                swept.append("begun")
-                swept.extend(other.sweep(older_than_hours=-0.1))
-            return listed if moment == "find" else call(*args, **options)
-
-        monkeypatch.setattr(backend.fs, moment, other_first)
+        swept = swept_by_other_first(monkeypatch, store, other, moment)
         assert store.sweep(older_than_hours=-0.1) == []
         assert swept == ["begun", "toy-v1-bb/one", "toy-v1-bb/two", "toy-v1-cc/one"]
         assert store.keys() == ["toy-v1-aa"]

@@ -21,6 +21,7 @@ import pytest
 from extrags.errors import ConfigError, DamagedArtefactError, StoreError
 from extrags.store import Ref, Store
 from extrags.zarr_io import new_group, open_group, read_array, write_frames
+from tests.extrags.sweeping import swept_by_other_first
 from tests.s3 import BUCKET, SECRET, s3_server
 
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
@@ -136,16 +137,7 @@ def test_two_machines_sweep_at_once(
     for index in range(3):
         backend.fs.pipe_file(f"{backend.prefix}/toy-v1-{index}/attempt/half", b"x")
     other = Store(url, cache=tmp_path / "there")
-    call, swept = getattr(backend.fs, moment), []
-
-    def other_first(*args: Any, **options: Any) -> Any:
-        listed = call(*args, **options) if moment == "find" else None
-        if not swept:
-            swept.append("begun")
-            swept.extend(other.sweep(older_than_hours=-0.1))
-        return listed if moment == "find" else call(*args, **options)
-
-    monkeypatch.setattr(backend.fs, moment, other_first)
+    swept = swept_by_other_first(monkeypatch, store, other, moment)
     assert len(store.sweep(older_than_hours=-0.1)) + len(swept) - 1 in (3, 4)
     assert store.keys() == []
 
