@@ -37,6 +37,7 @@ from extrags.config import IngestConfig
 from extrags.errors import ConfigError, SourceError, SourceNotFoundError
 from extrags.lens import Lens
 from extrags.provenance import StereoCamera
+from extrags.yaml_text import read_yaml
 
 __all__ = ["CALIBRATION_VERSION", "LENS_OF_POSES", "read_calibration", "with_calibration_file"]
 
@@ -349,11 +350,9 @@ def _kalibr_cameras(text: str, file: Path) -> dict[str, Any]:
     Raises:
         SourceError: no YAML.
     """
-    import yaml
-
     try:
-        content = yaml.safe_load(text)
-    except yaml.YAMLError as error:
+        content = read_yaml(text)
+    except ValueError as error:
         raise SourceError(f"no YAML: {error}", file=file, field="calibration") from error
     named = content.keys() if isinstance(content, Mapping) else ()
     numbers = {int(found[1]): name for name in named if (found := _KALIBR_NAME.fullmatch(str(name)))}

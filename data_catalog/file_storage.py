@@ -21,6 +21,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from extrags.errors import SourceError
+from extrags.yaml_text import read_yaml
 
 __all__ = ["read_file_storage"]
 
@@ -75,10 +76,7 @@ def _yaml(text: str) -> Any:
     Loader.add_constructor(f"tag:yaml.org,2002:{_MATRIX}", matrix)
     # OpenCV's first line is no YAML directive.
     text = re.sub(r"\A\s*%YAML:1\.0\s*\n", "", text)
-    try:
-        return yaml.load(text, Loader=Loader)
-    except yaml.YAMLError as error:
-        raise ValueError(str(error)) from error
+    return read_yaml(text, Loader)
 
 
 def _json(text: str) -> Any:

@@ -8,9 +8,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from extrags.errors import ConfigError
+from extrags.yaml_text import read_yaml
 
 __all__ = ["FILE", "Declared", "chosen_deployments", "declared_deployments", "usual_file"]
 
@@ -115,8 +114,8 @@ def declared_deployments(file: Path) -> list[Declared]:
         ConfigError: for a file that cannot be read, or a deployment without name or entrypoint.
     """
     try:
-        content = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        content = read_yaml(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
         raise ConfigError(f"{file} cannot be read: {error}") from error
     entries = content.get("deployments") if isinstance(content, dict) else None
     if not isinstance(entries, list) or not entries:

@@ -11,8 +11,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from data_catalog.names import comparable_name, plain_name
 from data_catalog.patterns import is_pattern, matching_names
 from extrags.config import PipelineConfig
@@ -20,6 +18,7 @@ from extrags.config.settings import parsed_words, settings_of
 from extrags.errors import ConfigError
 from extrags.store import digest_of
 from extrags.user_paths import expanded
+from extrags.yaml_text import read_yaml
 
 __all__ = ["Chosen", "absolute_manifests", "chosen_sequences"]
 
@@ -130,8 +129,8 @@ def _manifest(file: Path) -> Iterator[Chosen]:
                 yield Chosen(name)
         return
     try:
-        content = json.loads(text) if suffix == ".json" else yaml.safe_load(text)
-    except (ValueError, yaml.YAMLError) as error:
+        content = json.loads(text) if suffix == ".json" else read_yaml(text)
+    except (RecursionError, ValueError) as error:
         raise ConfigError(f"the manifest {file} is no {suffix[1:].upper()}: {error}") from error
     shared: dict[str, Any] = {}
     if isinstance(content, dict):

@@ -32,6 +32,7 @@ from extrags.cameras import compose
 from extrags.config import IngestConfig
 from extrags.errors import PoseError, SourceError, SourceNotFoundError
 from extrags.lens import Lens
+from extrags.yaml_text import read_yaml
 
 __all__ = ["READER", "read_points", "read_poses", "read_view_names"]
 
@@ -134,8 +135,8 @@ def read_poses(folder: Path) -> Float[np.ndarray, "f 4 4"]:
 
     file = folder / "motion.yaml"
     try:
-        content: Any = yaml.load(_text(file), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
-    except yaml.YAMLError as error:
+        content: Any = read_yaml(_text(file), getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+    except ValueError as error:
         raise SourceError(f"not readable as YAML: {error}", file=file) from error
     entries = content.get("poses[]") if isinstance(content, dict) else None
     if not isinstance(entries, dict):

@@ -73,11 +73,11 @@ def _value(assignment: str, text: str) -> Any:
         return json.loads(text)
     except ValueError:
         pass
-    import yaml
+    from extrags.yaml_text import read_yaml
 
     try:
-        return yaml.safe_load(text)
-    except yaml.YAMLError as error:
+        return read_yaml(text)
+    except ValueError as error:
         raise ConfigError(f"--set {assignment}: the value is neither JSON nor YAML") from error
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from extrags.errors import ConfigError
 from extrags.user_paths import expanded
+from extrags.yaml_text import read_yaml
 
 __all__ = ["settings_of_file"]
 
@@ -50,8 +51,6 @@ def settings_of_file(file: Path) -> dict[str, Any]:
 
 def _content(file: Path) -> Mapping[Any, Any]:
     """The object that a file holds; an empty one of an empty file."""
-    import yaml
-
     kind = "JSON" if file.suffix.lower() == ".json" else "YAML"
     try:
         # Editors on Windows put a mark at the beginning.
@@ -63,7 +62,7 @@ def _content(file: Path) -> Mapping[Any, Any]:
         content = _of_json(text) if kind == "JSON" else _of_yaml(text)
     except _RepeatedKeyError as error:
         raise ConfigError(f"--config {file}: {error}") from error
-    except (RecursionError, ValueError, yaml.YAMLError) as error:
+    except (RecursionError, ValueError) as error:
         raise ConfigError(f"--config {file} is no {kind}: {' '.join(str(error).split())}") from error
     if content is None:
         return {}
@@ -104,11 +103,7 @@ def _of_yaml(text: str) -> Any:
                     seen.add((key.tag, key.value))
             return node
 
-    loader = UniqueKeys(text)
-    try:
-        return loader.get_single_data()
-    finally:
-        loader.dispose()
+    return read_yaml(text, UniqueKeys)
 
 
 def _entries(

@@ -33,6 +33,7 @@ from extrags.events import MetricRecorded, emit
 from extrags.output_files import write_file
 from extrags.sequence import EndoscopicSequence
 from extrags.user_paths import expanded
+from extrags.yaml_text import read_yaml
 
 __all__ = ["CACHE_VARIABLE", "KEY_VARIABLE", "URL_VARIABLE", "Caption", "caption_of", "check_source"]
 
@@ -133,11 +134,9 @@ def check_source(config: CaptionConfig) -> Path | None:
 
 
 def _from_file(name: str, file: Path) -> str:
-    import yaml
-
     try:
-        texts = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        texts = read_yaml(file.read_text(encoding="utf-8"))
+    except ValueError as error:
         raise SourceError(f"not readable as YAML or JSON ({error})", file=file) from error
     if not isinstance(texts, dict):
         raise SourceError(f"expected {{name: text}}, found a {type(texts).__name__}", file=file)

@@ -20,6 +20,7 @@ from extrags.model_files import files_fingerprint
 from extrags.restoration.pretrained import checkpoint_driver
 from extrags.restoration.pretrained.captions import KEY_VARIABLE
 from extrags.user_paths import expanded
+from extrags.yaml_text import read_yaml
 
 __all__ = ["Clone", "check_clone", "check_interpreter", "clone_fingerprint", "guidance_scale", "run_clone"]
 
@@ -131,13 +132,11 @@ def clone_fingerprint(settings: CheckpointConfig) -> str:
 
 
 def _target(config: Path) -> str:
-    import yaml
-
     try:
-        description = yaml.safe_load(config.read_text(encoding="utf-8"))
+        description = read_yaml(config.read_text(encoding="utf-8"))
         target = description["model"]["target"]
         description["model"]["params"]
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except ValueError as error:
         raise ConfigError(f"{config}: not readable as YAML ({error})") from error
     except (KeyError, TypeError) as error:
         raise ConfigError(f"{config}: expected model.target and model.params ({error})") from error
