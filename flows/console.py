@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from rich.cells import cell_len
 from rich.console import Console
 from rich.markup import escape
 from rich.measure import Measurement
@@ -45,7 +46,7 @@ def print_outcomes(run: DatasetOutcome, seconds: float) -> None:
                 *(_change(name, figure_of(final, name), figure_of(restored, name)) for name in columns),
             )
     # No word is broken but a name, which may be folded to a third of the width.
-    names = max((len(outcome.title) for outcome in run.sequences), default=0)
+    names = max((cell_len(outcome.title) for outcome in run.sequences), default=0)
     needed = Measurement.get(out, out.options.update(max_width=10_000), table).minimum
     if needed - max(0, names - out.width // 3) <= out.width:
         out.print(table)

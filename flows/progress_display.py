@@ -12,6 +12,7 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Literal
 
+from rich.cells import cell_len
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.live import Live
 from rich.markup import escape
@@ -24,6 +25,7 @@ from extrags.stages import StageName, stages_until
 from extrags.store import Store
 from flows.estimate import RunEstimate, expected_seconds
 from flows.previews import stage_preview
+from flows.printable import printable
 from flows.terminal import console
 from tasks.progress import Pace, StageProgress, duration_text, observed, rate_text
 
@@ -202,8 +204,8 @@ class RunDisplay:
 
     def _stages(self, label: str, width: int) -> Text:
         """`phantom/11@sparse  ✓ ingest  - poses  ▸ coarse  · assess`, with breaks between stages alone."""
-        estimate = self._estimate.in_work[label]
-        words, used = Text.assemble((label, "bold")), len(label)
+        estimate, shown = self._estimate.in_work[label], printable(label)
+        words, used = Text.assemble((shown, "bold")), cell_len(shown)
         for stage in stages_until(self._run.until):
             ended = estimate.ended.get(stage)
             if ended is not None:

@@ -14,6 +14,7 @@ from extrags.errors import ConfigError, DamagedArtefactError, StoreError
 from flows.commands.common import counted, existing_store, set_up_logging, write_json
 from flows.commands.options import Parser, add_json, add_store, add_verb
 from flows.commands.status import size_text
+from flows.printable import printable
 
 if TYPE_CHECKING:
     from extrags.store import Store
@@ -338,7 +339,8 @@ def gc(given: argparse.Namespace) -> int:
         for name in leftovers:
             print(name)
         for item in removed:
-            print(f"artefacts/{item.key}  {item.sequence}  {size_text(item.bytes)}  {item.reason}")
+            said = f"{item.sequence}  {size_text(item.bytes)}  {item.reason}"
+            print(printable(f"artefacts/{item.key}  {said}"))
         would = "would be " if given.dry_run else ""
         print(f"{counted(len(leftovers), 'leftover')} {would}removed from {store.root}")
         freed = size_text(sum(item.bytes for item in removed))

@@ -18,6 +18,7 @@ from extrags.errors import ConfigError, ExtragsError, StoreError
 from extrags.redaction import CredentialFilter, without_credentials
 from extrags.user_paths import expanded
 from flows.commands.outputs import STANDARD_OUTPUT, write_output
+from flows.printable import PrintableFormatter
 
 if TYPE_CHECKING:
     from extrags.config import PipelineConfig
@@ -275,7 +276,8 @@ def set_up_logging(*, debug: bool, terminal: bool, quiet: bool = False) -> None:
     # The handler's as well as the loggers': a run on a lasting server sends more to its log than is shown.
     handler.setLevel(level)
     handler.addFilter(CredentialFilter())
-    logging.basicConfig(level=level, format="%(asctime)s %(message)s", datefmt="%H:%M:%S", handlers=[handler])
+    handler.setFormatter(PrintableFormatter("%(asctime)s %(message)s", "%H:%M:%S"))
+    logging.basicConfig(level=level, handlers=[handler])
     for noisy in ("httpx", "httpcore", "prefect", "distributed", "distributed.scheduler", "asyncio"):
         logging.getLogger(noisy).setLevel(logging.WARNING if debug else logging.CRITICAL)
 

@@ -1,0 +1,63 @@
+"""Names in files of others do not steer the terminal, in a table, an error or the log."""
+
+from __future__ import annotations
+
+import io
+import logging
+
+import pytest
+from rich.markup import escape
+from rich.table import Table
+from rich.text import Text
+
+from flows.cli import main
+from flows.printable import PrintableFormatter, printable
+from flows.terminal import console
+
+EVIL = "a\x1b]0;title\x07\x1b[2J\x9b1A\r\u202eb"
+SHOWN = r"a\x1b]0;title\x07\x1b[2J\x9b1A\r\u202eb"
+
+
+def test_what_a_terminal_obeys_is_shown() -> None:
+    assert printable(EVIL) == SHOWN
+    assert printable("Polyp 3, 大腸\tα\n– ✓") == "Polyp 3, 大腸\tα\n– ✓"  # noqa: RUF001
+
+
+@pytest.mark.parametrize("what", ["words", "text", "table"])
+def test_on_the_console(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = console()
+    monkeypatch.setattr(out, "file", io.StringIO())
+    table = Table("name", "next")
+    table.add_row(escape(EVIL), Text(EVIL))
+    out.print({"words": escape(EVIL), "text": Text(EVIL), "table": table}[what])
+    written = out.file.getvalue()  # type: ignore[attr-defined]
+    assert r"\x1b[2J\x9b1A" in written
+    assert not any(letter in written for letter in "\x1b\x07\x9b\r\u202e")
+
+
+def test_colours_of_the_console_itself_stay(monkeypatch: pytest.MonkeyPatch) -> None:
+    out = console()
+    monkeypatch.setattr(out, "file", io.StringIO())
+    monkeypatch.setattr(out, "_color_system", 1)
+    out.print("[red]no[/]")
+    assert "\x1b[31mno\x1b[0m" in out.file.getvalue()  # type: ignore[attr-defined]
+
+
+def test_a_name_is_no_emoji(monkeypatch: pytest.MonkeyPatch) -> None:
+    out = console()
+    monkeypatch.setattr(out, "file", io.StringIO())
+    out.print("scan:a:1")
+    assert out.file.getvalue() == "scan:a:1\n"  # type: ignore[attr-defined]
+
+
+def test_in_errors(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["data", "validate", EVIL]) == 2
+    assert "\x1b" not in capsys.readouterr().err
+    assert main(["data", "check", f"/nowhere/{EVIL}"]) != 0
+    written = capsys.readouterr()
+    assert "\x1b" not in written.err + written.out
+
+
+def test_in_the_log() -> None:
+    record = logging.makeLogRecord({"msg": "frame %s\n  of", "args": (EVIL,)})
+    assert PrintableFormatter("%(message)s").format(record) == f"frame {SHOWN}\n  of"
