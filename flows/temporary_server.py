@@ -57,6 +57,11 @@ _started: dict[str, subprocess.Popen[bytes]] = {}
 """The server of this process by its address; at most one."""
 
 
+CORS_VARIABLES = ("PREFECT_SERVER_API_CORS_ALLOWED_ORIGINS", "PREFECT_SERVER_CORS_ALLOWED_ORIGINS")
+"""Both names of the setting that lets pages of other sites read what the server answers. By default, those of
+all sites may: what any of them, open in a browser meanwhile, asked for the runs of this machine was told."""
+
+
 class ServerError(ExtragsError, RuntimeError):
     """The temporary server did not start, or cannot go on."""
 
@@ -170,7 +175,9 @@ def _launch(settings: dict[str, str]) -> tuple[str, subprocess.Popen[bytes]]:
     # The port is taken here and handed over, so that nobody else can take it meanwhile.
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
-        address = f"http://127.0.0.1:{listener.getsockname()[1]}/api"
+        origin = f"http://127.0.0.1:{listener.getsockname()[1]}"
+        address = f"{origin}/api"
+        environment |= dict.fromkeys(CORS_VARIABLES, origin)
         process = subprocess.Popen(
             [sys.executable, "-P", "-m", "flows.temporary_server", str(listener.fileno())],
             stdin=subprocess.PIPE,

@@ -17,6 +17,7 @@ from prefect.settings import (
     temporary_settings,
 )
 
+from flows import temporary_server as server_module
 from flows.temporary_server import DATABASE, ServerError, copy_database, database_address, temporary_server
 
 
@@ -95,3 +96,22 @@ def test_a_server_that_fails_because_it_cannot_write_says_so(
         server.wait()
     if told is ServerError:
         assert "cannot be written (No such file or directory)" in str(raised.value)
+
+
+def test_pages_of_other_sites_are_told_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    from prefect.settings import get_current_settings
+
+    given: dict[str, str] = {}
+
+    class Process:
+        def __init__(self, command: list[str], *, env: dict[str, str], **_: object) -> None:
+            given.update(env)
+
+    monkeypatch.setattr(subprocess, "Popen", Process)
+    monkeypatch.setattr(server_module.atexit, "register", lambda *_: None)
+    # As somebody's own server is told to.
+    address, _ = server_module._launch({"PREFECT_SERVER_CORS_ALLOWED_ORIGINS": "*"})
+    for name in server_module.CORS_VARIABLES:
+        monkeypatch.setenv(name, given[name])
+    allowed = type(get_current_settings())().server.api.cors_allowed_origins
+    assert allowed == address.removesuffix("/api")
