@@ -11,9 +11,14 @@ import logging
 import tempfile
 import threading
 import time
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from http import HTTPStatus
+from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
+from urllib.parse import urlsplit
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -79,7 +84,7 @@ class ViewServer:
         self._viewers: dict[int, _Viewer] = {}
         self._left: set[int] = set()
         self._guard = threading.Lock()
-        with _silent():
+        with _silent(), refusing_other_sites(host):
             self._server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
         # A page can ask viser for a tunnel that shows the scene to the world by way of viser's own servers.
         self._server.request_share_url = _not_shared
@@ -119,6 +124,60 @@ class ViewServer:
     def _stop(self) -> None:
         with _silent():
             self._server.stop()
+
+
+@contextlib.contextmanager
+def refusing_other_sites(host: str) -> Iterator[None]:
+    """Servers of web sockets that are started inside the block refuse pages of other sites.
+
+    Browsers let any page connect to this machine, and viser asks none where it comes from: it would be sent
+    the pictures of the scene. A page of a name that is made to lead here counts as another site.
+
+    Args:
+        host: address that the server listens at.
+    """
+    from websockets.asyncio import server as sockets
+
+    serve, told = sockets.serve, set[str]()
+
+    def guarded(*given: Any, process_request: Any = None, **options: Any) -> Any:
+        def check(connection: Any, request: Any) -> Any:
+            origins, names = request.headers.get_all("Origin"), request.headers.get_all("Host")
+            if not all(_is_own_page(origin, names, host) for origin in origins):
+                shown = ", ".join(origins)
+                if shown not in told:
+                    told.add(shown)
+                    logger.warning("a page of %s asked for the scene, and was refused", shown)
+                return connection.respond(HTTPStatus.FORBIDDEN, "a page of another site\n")
+            return None if process_request is None else process_request(connection, request)
+
+        return serve(*given, process_request=check, **options)
+
+    with patch.object(sockets, "serve", guarded):
+        yield
+
+
+def _is_own_page(origin: str, names: Sequence[str], host: str) -> bool:
+    """Whether a page comes from this server.
+
+    Args:
+        origin: that the browser tells.
+        names: of the server, as the browser knows it.
+        host: address that the server listens at.
+    """
+    try:
+        page = urlsplit(origin)
+        name = page.hostname or ""
+    except ValueError:
+        return False
+    return [page.netloc] == list(names) and (_is_this_machine(name) or not _is_this_machine(host))
+
+
+def _is_this_machine(name: str) -> bool:
+    try:
+        return ip_address(name).is_loopback
+    except ValueError:
+        return name == "localhost" or name.endswith(".localhost")
 
 
 def _silent() -> contextlib.redirect_stdout[io.StringIO]:

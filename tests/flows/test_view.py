@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import importlib.util
 import json
 import sys
@@ -24,6 +25,7 @@ from extrags.scene import Scene
 from extrags.splat_files import write_ply_scene
 from extrags.store import Store
 from extrags.view import SceneRenderer
+from flows import view_server
 from flows.cli import main, parser
 from flows.commands import view as command
 from flows.outcome import SequenceOutcome
@@ -326,6 +328,53 @@ class TestBrowser:
         server.stop()
 
 
+@pytest.mark.parametrize(
+    ("host", "origin", "name", "own"),
+    [
+        ("127.0.0.1", "http://127.0.0.1:8080", "127.0.0.1:8080", True),
+        # By way of a tunnel that begins at another port.
+        ("127.0.0.1", "http://localhost:9000", "localhost:9000", True),
+        ("127.0.0.1", "http://evil.example", "127.0.0.1:8080", False),
+        ("127.0.0.1", "http://localhost:3000", "localhost:8080", False),
+        # A name that its owner has made to lead to this machine.
+        ("127.0.0.1", "http://evil.example:8080", "evil.example:8080", False),
+        ("127.0.0.1", "null", "127.0.0.1:8080", False),
+        ("::1", "http://[::1]:8080", "[::1]:8080", True),
+        ("0.0.0.0", "http://station.lab:8080", "station.lab:8080", True),
+        ("0.0.0.0", "http://evil.example", "station.lab:8080", False),
+    ],
+)
+def test_whose_pages_are_shown_the_scene(host: str, origin: str, name: str, own: bool) -> None:
+    assert view_server._is_own_page(origin, [name], host) == own
+
+
+def test_pages_of_other_sites_are_refused(caplog: pytest.LogCaptureFixture) -> None:
+    from websockets import Origin
+    from websockets.asyncio import client, server
+    from websockets.exceptions import InvalidStatus
+
+    async def told(origin: str | None) -> str:
+        async with client.connect(address, origin=None if origin is None else Origin(origin)) as browser:
+            return str(await browser.recv())
+
+    async def serve() -> None:
+        nonlocal address
+        with view_server.refusing_other_sites("127.0.0.1"):
+            serving = server.serve(lambda connection: connection.send("the scene"), "127.0.0.1", 0)
+        async with serving as listening:
+            port = next(iter(listening.sockets)).getsockname()[1]
+            address = f"ws://127.0.0.1:{port}"
+            assert await told(None) == await told(f"http://127.0.0.1:{port}") == "the scene"
+            for _ in range(2):
+                with pytest.raises(InvalidStatus, match="403"):
+                    await told("http://evil.example")
+
+    address = ""
+    asyncio.run(serve())
+    refused = [record.message for record in caplog.records if record.name == "flows.view_server"]
+    assert refused == ["a page of http://evil.example asked for the scene, and was refused"]
+
+
 @pytest.mark.skipif(not REAL, reason="viser is not installed: pip install -e '.[view]'")
 def test_a_real_server_answers_a_real_browser(
     renderer: SceneRenderer, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
@@ -334,11 +383,14 @@ def test_a_real_server_answers_a_real_browser(
     import msgspec.msgpack
     import viser
     import zstandard
+    from websockets.exceptions import InvalidStatus
     from websockets.sync.client import connect
 
     server = ViewServer(renderer, port=0, width=160)
     try:
         protocol = f"viser-v{viser.__version__}"
+        with pytest.raises(InvalidStatus, match="403"):
+            connect(server.url.replace("http", "ws"), subprotocols=[protocol], origin="http://evil.example")  # type: ignore[list-item, arg-type]
         with connect(server.url.replace("http", "ws"), subprotocols=[protocol], max_size=None) as browser:  # type: ignore[list-item]
 
             def look(height: float) -> None:
