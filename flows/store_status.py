@@ -63,9 +63,9 @@ class StatusRow:
     Args:
         sequence: its name.
         variant: method, profile, seed and what a matrix changed, in words.
-        state: `failed` where the last run did, `running` where one of its artefacts is being made now or its
-            first run is going on, `done` where all of its stages are there, `stopped` where its only runs
-            were interrupted, else `missing`.
+        state: `failed` where the last run did, `running` where one of its artefacts is being made now, or a
+            run is going on that is its first or tries again what failed, `done` where all of its stages are
+            there, `stopped` where its only runs were interrupted, else `missing`.
         reason: why it failed.
         ended: when its last run came to an end, UTC; empty where none is on record.
         psnr: of the final scene, in dB.
@@ -197,6 +197,13 @@ def store_status(store: Store, patterns: Sequence[str] = ()) -> StoreStatus:
         if name in names:
             bytes_of |= {key: size for key, size in made.items() if key in there}
             row = _row(record, there, _making(record, making, going_on))
+            again = _again(record, going_on)
+            if row.reason and again is not None:
+                # What failed is being tried again: how the run before ended is no news any more.
+                manifests = _manifests(store, again.keys & there)
+                bytes_of |= {manifest.key: manifest.bytes for manifest in manifests}
+                now = _unrecorded(name, again, running.get(again.sequence, set()), manifests)
+                row = replace(now, variant=row.variant, ended=row.ended)
             rows.append(replace(row, sequence=name, report=recorded_page(store, record, there)))
     shown = {row.sequence for row in rows}
     for name in names:
@@ -250,6 +257,19 @@ def _making(record: OutcomeRecord, making: Sequence[Mapping[str, str]], going_on
         for item in making
         if item["label"] == record["sequence"] and (item["key"] in own or not unlike)
     }
+
+
+def _again(record: OutcomeRecord, going_on: Sequence[Run]) -> Run | None:
+    """The run that is going on with the settings of a run on record; None without one."""
+    keys = [
+        run.keys
+        for run in going_on
+        if run.sequence == record["sequence"]
+        and run.config
+        and run.config == record.get("config")
+        and (run.place or comparable_name(run.sequence)) == recorded_name(record)
+    ]
+    return Run("", str(record["sequence"]), "", frozenset().union(*keys)) if keys else None
 
 
 def _unlike(records: Sequence[OutcomeRecord], going_on: Sequence[Run]) -> dict[str, Run]:

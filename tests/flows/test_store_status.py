@@ -195,6 +195,31 @@ def test_a_failure_says_why(store: Store) -> None:
     assert [row.stages[stage].state for stage in STAGES[:4]] == ["failed", "skipped", "missing", "missing"]
 
 
+def test_what_failed_and_is_tried_again(store: Store, finished: tuple[str, SequenceOutcome]) -> None:
+    rows = [
+        StageRow("ingest", "failed", reason="no frames"),
+        StageRow("coarse", "skipped", reason="as before"),
+    ]
+    failed = SequenceOutcome(SEQUENCE, "failed", rows)
+    keys = half_a_run(store, finished)
+    record_outcome(store, CASE, failed, "report", tiny_config())
+    with recorded_run(store, SEQUENCE, digest_of(tiny_config())) as record:
+        assert record is not None
+        # Before its first artefact, too.
+        assert [row.state for row in store_status(store).rows] == ["running"]
+        record.add(keys)
+        (row,) = store_status(store).rows
+        assert (row.state, row.variant, row.reason) == ("running", "quick", "")
+        assert [row.stages[stage].state for stage in ("ingest", "coarse", "finetune")] == [
+            "done",
+            "done",
+            "missing",
+        ]
+        assert main(["status", "--store", store.root]) == 0
+    with recorded_run(store, SEQUENCE, "other"):
+        assert "failed" in store_status(store).counts
+
+
 def test_patterns_show_what_was_never_run_as_well(store: Store) -> None:
     rows = store_status(store, ["phantom/[01]@sparse"]).rows
     assert [(row.sequence, row.state) for row in rows] == [
