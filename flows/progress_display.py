@@ -225,7 +225,8 @@ class RunDisplay:
     def _whole(self, now: float, width: int) -> Table:
         run = self._estimate
         share = run.share(now)
-        words = [f"{100 * share:.0f} %"]
+        # What rounds to a hundred per cent is not done.
+        words = [f"{min(round(100 * share), 100 if run.ended >= run.sequences else 99)} %"]
         if run.sequences > 1:
             words.append(f"{run.ended} of {run.sequences} sequences done")
         if run.failed:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from typing import TYPE_CHECKING, Any
 
 from extrags.config import LARGEST_SEED, PipelineConfig
 from extrags.config.settings import parsed_words, settings_of
 from extrags.errors import ConfigError
 from flows.commands.common import (
+    is_terminal,
     items,
     parsed_settings,
     set_up_logging,
@@ -96,7 +96,7 @@ def benchmark(given: argparse.Namespace) -> int:
     from flows.environment import prepare, without_heartbeat
 
     say_when_interrupted(RESUMABLE)
-    terminal = sys.stderr.isatty()
+    terminal = is_terminal()
     set_up_logging(debug=given.debug, terminal=terminal, quiet=given.quiet)
     root = store_root(given)
     # Any: the flow wants the literal names, which are looked at below.

@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+import os
 import shlex
 import sys
 from collections.abc import Sequence
@@ -34,6 +35,7 @@ __all__ = [
     "existing_store",
     "finished_run",
     "further_settings",
+    "is_terminal",
     "items",
     "parsed_settings",
     "run_config",
@@ -282,11 +284,16 @@ def set_up_logging(*, debug: bool, terminal: bool, quiet: bool = False) -> None:
         logging.getLogger(noisy).setLevel(logging.WARNING if debug else logging.CRITICAL)
 
 
+def is_terminal() -> bool:
+    """Whether standard error goes to a terminal that can draw over what it shows; others get lines."""
+    return sys.stderr.isatty() and os.environ.get("TERM", "").lower() not in ("dumb", "unknown")
+
+
 def showing(given: argparse.Namespace) -> Literal["terminal", "log", "nothing"]:
     """Where the progress of a run goes: see `flows.progress_display`."""
     if given.quiet:
         return "nothing"
-    return "terminal" if sys.stderr.isatty() else "log"
+    return "terminal" if is_terminal() else "log"
 
 
 def further_settings(texts: Sequence[str], model: type[StageConfig]) -> dict[str, Any]:

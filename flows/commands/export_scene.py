@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -11,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from extrags.errors import ConfigError, ExtragsError, StoreError
-from flows.commands.common import finished_run, run_config, set_up_logging, showing
+from flows.commands.common import finished_run, is_terminal, run_config, set_up_logging, showing
 from flows.commands.outputs import made_folder
 
 if TYPE_CHECKING:
@@ -37,7 +36,7 @@ def export_scene(given: argparse.Namespace) -> int:
         ConfigError: for a method without Gaussians, or a trajectory that is not there.
         StoreError: when the run is not in the store, or the file cannot be written.
     """
-    set_up_logging(debug=given.debug, terminal=sys.stderr.isatty(), quiet=given.quiet)
+    set_up_logging(debug=given.debug, terminal=is_terminal(), quiet=given.quiet)
     config = run_config(given)
     if config.uc_nerf.enabled and given.to != "camera-path":
         raise ConfigError(f"the method {given.method} makes no Gaussians to write as {given.to}")

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from extrags.errors import CaptureError, ConfigError, WeightsError
-from flows.commands.common import set_up_logging, showing, training_settings
+from flows.commands.common import is_terminal, set_up_logging, showing, training_settings
 from flows.commands.options import Parser, add_output
 from flows.commands.outputs import output_folder
 from flows.commands.pretrain_scenes import SOURCES, make_scenes, scene_sources
@@ -187,7 +186,7 @@ def _add_networks(parser: Parser) -> None:
 def pretrain(given: argparse.Namespace) -> int:
     """`extrags pretrain`."""
     say_when_interrupted(INTERRUPTED)
-    terminal = sys.stderr.isatty()
+    terminal = is_terminal()
     set_up_logging(debug=given.debug, terminal=terminal, quiet=given.quiet)
     # Before torch is imported: threads that spin while they wait slow each other down.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")

@@ -18,6 +18,7 @@ from extrags.errors import (
     ExtragsError,
 )
 from flows.commands.common import (
+    is_terminal,
     items,
     run_config,
     set_up_logging,
@@ -223,7 +224,7 @@ def execute(
     from flows.temporary_server import start_early, stop_early
 
     say_when_interrupted(RESUMABLE)
-    set_up_logging(debug=given.debug, terminal=sys.stderr.isatty(), quiet=given.quiet)
+    set_up_logging(debug=given.debug, terminal=is_terminal(), quiet=given.quiet)
     root = store_root(given)
     several = several or Several(methods=(given.method,), seeds=(given.seed,))
     if several.methods == (given.method,):
@@ -341,7 +342,7 @@ def _in_a_flow(
     from flows.expectation import expectations, expected_words
 
     root, until, at_once = arguments["store"], arguments["until"], arguments["at_once"]
-    if sys.stderr.isatty() and not given.quiet and len(cases) > 1:
+    if is_terminal() and not given.quiet and len(cases) > 1:
         # Elsewhere it is a line of the log.
         expected = expectations(cases, root, until, refresh=arguments["refresh"])
         print(

@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
+from extrags.stages import STAGES
 from extrags.store import Store
 from flows.outcome import SequenceOutcome
 from flows.previews import stage_preview
@@ -63,6 +64,25 @@ class TestDisplay:
         assert "400 of 1000, 40/s, about 15 s left" in shown
         assert "loss 0.031" in shown
         assert "10 s so far" in shown
+
+    def test_what_is_not_done_is_no_hundred_per_cent(self) -> None:
+        terminal = Terminal()
+        terminal.starts("evaluate")
+        for stage in STAGES[:-1]:
+            terminal.ends(stage)
+        terminal.starts("report")
+        terminal.at("report", 9999, 10000)
+        assert "  99 %, " in terminal.shown()
+        terminal.ends("report")
+        assert "  100 %, " in terminal.shown()
+
+    @pytest.mark.parametrize("label", ["大腸の内視鏡" * 3, "c" * 36])
+    def test_breaks_stand_between_stages_however_wide_the_letters(self, label: str) -> None:
+        terminal = Terminal(width=60)
+        terminal.starts("ingest", label)
+        first, second, *_ = terminal.shown().splitlines()
+        assert first.rstrip() == f"{label}  ▸ ingest  · poses"
+        assert second.startswith("  · depth")
 
     def test_the_end_of_a_stage_is_a_line_above(self) -> None:
         terminal = Terminal()

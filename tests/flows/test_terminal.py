@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import logging
+from argparse import Namespace
+from types import SimpleNamespace
 
 import pytest
 from rich.markup import escape
@@ -11,6 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from flows.cli import main
+from flows.commands.common import showing
 from flows.printable import PrintableFormatter, printable
 from flows.terminal import console
 
@@ -61,3 +64,15 @@ def test_in_errors(capsys: pytest.CaptureFixture[str]) -> None:
 def test_in_the_log() -> None:
     record = logging.makeLogRecord({"msg": "frame %s\n  of", "args": (EVIL,)})
     assert PrintableFormatter("%(message)s").format(record) == f"frame {SHOWN}\n  of"
+
+
+@pytest.mark.parametrize(
+    ("terminal", "kind", "shown"),
+    [(True, "xterm", "terminal"), (True, "dumb", "log"), (False, "xterm", "log")],
+)
+def test_a_terminal_that_cannot_draw_gets_lines_of_progress(
+    terminal: bool, kind: str, shown: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.stderr", SimpleNamespace(isatty=lambda: terminal))
+    monkeypatch.setenv("TERM", kind)
+    assert showing(Namespace(quiet=False)) == shown
