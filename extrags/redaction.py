@@ -19,9 +19,10 @@ __all__ = ["HIDDEN", "CredentialFilter", "has_credentials", "without_credentials
 HIDDEN = "***"
 """Stands where a credential was."""
 
-# Secrets may hold slashes; what follows a colon as a number is a port, though.
+# Secrets may hold slashes; what follows a colon as a number is a port, though. Lengths are bounded, and the
+# scheme is not looked at: names in files of others could otherwise make this take the square of their length.
 _USER = re.compile(
-    r"""(?P<scheme>\b[a-zA-Z][\w+.-]*://)(?:[^\s/@:"'<>]*:(?!\d{1,5}(?:[/?#]|$))[^\s@"'<>]*|[^\s/@"'<>?#]+)@"""
+    r"""://(?:[^\s/@:"'<>]{0,1024}:(?!\d{1,5}(?:[/?#]|$))[^\s@"'<>]{0,2048}|[^\s/@"'<>?#]{1,2048})@"""
 )
 _QUERY = re.compile(
     r"""(?P<name>[?&;][^=&;\s"'<>]{0,64}(?:key|token|secret|pass|pwd|sig|auth|credential)"""
@@ -54,7 +55,7 @@ def without_credentials(text: str) -> str:
             if value in text:
                 text = text.replace(value, HIDDEN)
     if "://" in text:
-        text = _USER.sub(rf"\g<scheme>{HIDDEN}@", text)
+        text = _USER.sub(f"://{HIDDEN}@", text)
         text = _QUERY.sub(rf"\g<name>{HIDDEN}", text)
     for header in (_HEADER, _BEARER):
         text = header.sub(rf"\g<name>{HIDDEN}", text)

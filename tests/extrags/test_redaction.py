@@ -130,3 +130,9 @@ def test_manifests_do_not_tell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert SECRET not in written
     assert CAPTION_KEY not in written
     assert store.verify(slot.ref)
+
+
+@pytest.mark.parametrize("text", ["a." * 200_000 + "://x", "a://" * 50_000])
+def test_long_text_takes_no_square_of_its_length(text: str) -> None:
+    # It would come to an end after many minutes.
+    assert without_credentials(text) == text
