@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -92,8 +93,10 @@ def build_gallery(
 
 
 def _head(title: str, command: str, made: str) -> str:
+    # Longer than any in a name, which could else end the block.
+    fence = "`" * max([3, *(len(found) + 1 for found in re.findall("`+", command))])
     return (
-        f"# {title}\n\nMade by{f' {made}' if made else ''}\n\n```bash\n{command}\n```\n\n"
+        f"# {title}\n\nMade by{f' {made}' if made else ''}\n\n{fence}bash\n{command}\n{fence}\n\n"
         "Of each run stand here the held-out view whose PSNR is the median of all, and the middle one of its "
         "virtual views: none is picked by its looks. Figures below an image are those of this view alone. "
         "Unless said otherwise, no stage has seen the held-out frames. Cyan in *never observed* is surface "
@@ -140,7 +143,8 @@ def _strip(run: GalleryRun, folder: Path, largest_bytes: int, number_of_run: int
         virtual = virtual_rows(run.pseudo, sequence, 1, largest_bytes)
         row, ends = virtual.rows[0], [f"{scale.low} dark to {scale.high} pale" for scale in virtual.scales]
         said = dict(zip(("Uncertainty", "Expected error"), ends, strict=False))
-        lines.append(f"{row.title} of {len(run.pseudo.rendered)}: {row.note}.\n")
+        # The name of a frame stands in the note.
+        lines.append(f"{_plain(row.title)} of {len(run.pseudo.rendered)}: {_plain(row.note)}.\n")
         lines.append(_table(row.cells, said, folder, f"{name}_virtual"))
     return "\n".join(lines)
 
@@ -207,5 +211,5 @@ def _table(cells: Sequence[ImageCell], said: Mapping[str, str], folder: Path, st
 
 
 def _plain(text: str) -> str:
-    """Words that no name in them can end a cell or a link of."""
-    return "".join(" " if letter in "|[]<>`\r\n" else letter for letter in text)
+    """Words that no name in them can end a cell or a link of, or make a part of a page of."""
+    return "".join(" " if letter in "|[]<>`\\" or not letter.isprintable() else letter for letter in text)

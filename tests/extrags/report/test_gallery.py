@@ -116,3 +116,18 @@ def test_names_end_no_cell(run: GalleryRun, tmp_path: Path) -> None:
     text = built([replace(run, sequence=replace(run.sequence, frame_names=names))], tmp_path)
     assert "a b" in text
     assert {line.count("|") for line in text.splitlines() if line.startswith("|")} == {6, 7}
+
+
+def test_names_make_no_part_of_the_page(run: GalleryRun, tmp_path: Path) -> None:
+    names = tuple(f"<img src=x onerror=alert({index})>\x1b]0;{index}" for index in range(len(run.sequence)))
+    text = built([replace(run, sequence=replace(run.sequence, frame_names=names))], tmp_path)
+    assert "img src=x" in text
+    assert "<" not in text
+    assert "\x1b" not in text
+
+
+def test_a_name_in_the_command_does_not_end_its_block(run: GalleryRun, tmp_path: Path) -> None:
+    page = build_gallery(
+        [run], tmp_path, title="Some", command="extrags gallery 'a\n```\nb'", largest_bytes=400_000
+    )
+    assert "\n````bash\nextrags gallery 'a\n```\nb'\n````\n" in page.read_text(encoding="utf-8")
