@@ -231,6 +231,22 @@ class TestObserved:
         hidden = joined(WALL, shield)
         assert seen_by(points, hidden, cameras, mask, np.inf).tolist() == [False, True, True]
 
+    def test_seen_is_what_any_of_several_cameras_sees(self, sequence: EndoscopicSequence) -> None:
+        """Each looks from its own place, past its own side of what stands before the wall, through its mask."""
+        shield = rectangle((-1, -30), (1, 30), 10)
+        points = np.array([[-10.0, 0, WALL_MM], [10.0, 0, WALL_MM], [4.0, 0, WALL_MM], [-4.0, 0, WALL_MM]])
+        hidden, mask = joined(WALL, shield), sequence.mask.copy()
+
+        def seen(views: list[int]) -> list[bool]:
+            return seen_by(points, hidden, sequence.cameras[views], mask[views], np.inf).tolist()
+
+        # From x = -4 the shield hides the wall from 2 to 6 mm, from x = 4 the other side.
+        assert seen([0]) == [True, False, False, True]
+        assert seen([1]) == [False, True, True, False]
+        assert seen([0, 1]) == seen([1, 0]) == [True] * 4
+        mask[1] = False
+        assert seen([0, 1]) == [True, False, False, True]
+
     def test_masked_and_far_surface_is_not_seen(self, sequence: EndoscopicSequence) -> None:
         cameras, mask = sequence.cameras[[0]], sequence.mask[[0]].copy()
         points = np.array([[-9.0, 0, WALL_MM], [1.0, 0, WALL_MM]])
