@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -139,6 +139,11 @@ class TestWholeSurfaces:
         assert errors.completeness_mm is None
         assert errors.precision is None
 
+    @pytest.mark.parametrize("nothing", [EMPTY, LINE], ids=["no triangle", "no area"])
+    def test_against_nothing_nothing_is_measured(self, nothing: Mesh) -> None:
+        errors = surface_errors(rectangle((0, 0), (1, 1), 0), nothing, 1.0)
+        assert set(asdict(errors).values()) == {None}
+
     def test_a_threshold_must_be_a_length(self) -> None:
         with pytest.raises(ConfigError, match="above zero"):
             surface_errors(EMPTY, EMPTY, 0.0)
@@ -232,7 +237,7 @@ class TestObserved:
         assert seen_by(points, hidden, cameras, mask, np.inf).tolist() == [False, True, True]
 
     def test_seen_is_what_any_of_several_cameras_sees(self, sequence: EndoscopicSequence) -> None:
-        """Each looks from its own place, past its own side of what stands before the wall, through its mask."""
+        """Each looks from its own place, past its own side of a shield, through its own mask."""
         shield = rectangle((-1, -30), (1, 30), 10)
         points = np.array([[-10.0, 0, WALL_MM], [10.0, 0, WALL_MM], [4.0, 0, WALL_MM], [-4.0, 0, WALL_MM]])
         hidden, mask = joined(WALL, shield), sequence.mask.copy()
