@@ -56,7 +56,8 @@ def test_over_all_sequences_every_pair_is_one_of_a_sample() -> None:
     judge_changes([row])
     whole = np.concatenate(samples)
     expected = stats.ttest_1samp(whole, 0).confidence_interval(0.95)
-    assert (row.n, row.change) == (6, pytest.approx(whole.mean()))
+    assert row.n == 6
+    assert row.change == pytest.approx(whole.mean())
     assert (row.low, row.high) == pytest.approx((expected.low, expected.high))
     assert row.before == 20.0
     assert row.after == pytest.approx(20.0 - np.mean([sample.mean() for sample in samples]))

@@ -243,7 +243,8 @@ class TestObserved:
         hidden, mask = joined(WALL, shield), sequence.mask.copy()
 
         def seen(views: list[int]) -> list[bool]:
-            return seen_by(points, hidden, sequence.cameras[views], mask[views], np.inf).tolist()
+            found = seen_by(points, hidden, sequence.cameras[views], mask[views], np.inf)
+            return [bool(flag) for flag in found]
 
         # From x = -4 the shield hides the wall from 2 to 6 mm, from x = 4 the other side.
         assert seen([0]) == [True, False, False, True]
