@@ -86,8 +86,12 @@ def test_surface_hidden_from_a_reference_is_not_borrowed() -> None:
     references = exact_references(tube_cameras(8), light)
     references.packed[:, 4] *= 2  # something stands at half the distance in every reference
     warped = warp_references(references, cameras, depth, count=4)
-    assert warped.blend_weight.max() == 0
-    assert warped.blend.abs().max() == 0
+    for weight, shown in (
+        (warped.blend_weight, warped.blend),
+        (warped.nearest_weight, warped.nearest),
+    ):
+        assert weight.max() == 0
+        assert shown.abs().max() == 0
 
 
 def test_the_best_reference_is_the_view_itself() -> None:
@@ -308,6 +312,12 @@ def test_the_exponent_is_found_in_spite_of_pixels_that_are_too_bright_or_too_dar
     ):
         references.packed[:, :3].masked_fill_(chosen[:, None], value)
     assert abs(fit_falloff_exponent(references) - 1.3) < 0.12
+
+
+def test_two_views_are_enough_for_an_exponent_and_one_is_not() -> None:
+    references = _fading_references(0.8)
+    assert abs(fit_falloff_exponent(references.subset(np.array([2, 4]))) - 0.8) < 0.12
+    assert fit_falloff_exponent(references.subset(np.array([2]))) == 0.0
 
 
 def test_views_that_are_not_trusted_tell_no_exponent() -> None:
