@@ -121,6 +121,15 @@ class TestAgreedViews:
         nothing = torch.zeros(2, *SIZE)
         assert torch.equal(agreed(rgb, plane_views([0.0, 0.5]), unconfirmed=nothing), rgb)
 
+    def test_a_view_without_holes_leads_the_others(self) -> None:
+        rgb = painted([0.3, 0.5])
+        unconfirmed = torch.ones(2, *SIZE)
+        unconfirmed[0] = 0
+        found = agreed(rgb, plane_views([0.0, 0.0]), unconfirmed=unconfirmed)
+        assert torch.equal(found[0], rgb[0])
+        middle = (..., slice(14, 18), slice(22, 26))
+        assert found[1][middle].mean() < 0.4
+
     def test_parts_must_fit(self) -> None:
         with pytest.raises(ShapeError, match="different lengths"):
             agreed(painted([0.3, 0.5]), plane_views([0.0]))
