@@ -46,6 +46,10 @@ def test_holes_and_masked_pixels_take_no_part() -> None:
     mask = torch.ones(8, 9, dtype=torch.bool)
     mask[6:] = False
     assert exposure_gain(render, target, mask).item() == pytest.approx(2, rel=1e-5)
+    # Nor does what is not known of the truth.
+    assert exposure_gain(target, render, mask).item() == pytest.approx(
+        float((0.5 * target[3:6].square()).sum() / target[:6].square().sum()), rel=1e-5
+    )
 
 
 def test_never_worse_in_squared_error_before_clipping() -> None:

@@ -83,8 +83,11 @@ class TestHarmonics:
         assert [schedule.sh_degree_at(i, 3) for i in (0, 399, 400, 800, 1200, 5000)] == [0, 0, 1, 2, 3, 3]
         assert schedule.sh_degree_at(1200, 1) == 1
 
-    def test_all_are_active_from_the_first_where_a_scene_exists(self) -> None:
-        assert schedule_with(None).resumed(seed=1).sh_degree_at(0, 3) == 3
+    def test_all_are_active_from_the_first_step_where_a_scene_exists(self) -> None:
+        resumed = schedule_with(None).resumed(seed=7)
+        assert resumed.sh_degree_at(0, 3) == 3
+        # Drawn anew: not the views of the first steps once more.
+        assert resumed.seed == 7 != schedule_with(None).seed
 
 
 class TestProgress:
