@@ -52,6 +52,16 @@ def test_holes_and_masked_pixels_take_no_part() -> None:
     )
 
 
+def test_what_the_gain_makes_too_bright_ends_at_one() -> None:
+    render = torch.tensor([0.1, 0.2, 0.3, 0.8])[None, :, None].expand(5, 4, 3)
+    target = (2 * render).clamp(max=1)
+    gain = exposure_gain(render, target).item()
+    assert 1 < gain < 2
+    expected = torch.tensor([0.1 * gain, 0.2 * gain, 0.3 * gain, 1.0])[None, :, None].expand(5, 4, 3)
+    assert 0.8 * gain > 1
+    torch.testing.assert_close(align_exposure(render, target), expected)
+
+
 def test_never_worse_in_squared_error_before_clipping() -> None:
     generator = torch.Generator().manual_seed(2)
     target = 0.2 + 0.5 * torch.rand(16, 16, 3, generator=generator)
