@@ -28,6 +28,24 @@ def test_readings_begin_with_the_mistakes_that_people_make() -> None:
     assert not any(np.allclose(reading, pose) for reading in read_as)
 
 
+def test_axes_are_named_by_where_they_come_from() -> None:
+    """Of names such as `axes (y, -x, z)` each letter is an axis of the file that becomes x, y or z."""
+    pose = look_at(np.array([3.0, 1, 2]), np.zeros(3), up=np.array([0.0, 1, 0]))[None]
+    columns = {letter: np.eye(3)[:, [k]] for k, letter in enumerate("xyz")}
+    columns |= {f"-{letter}": -column for letter, column in columns.items()}
+    told = 0
+    for name, found in other_readings(pose):
+        if "OpenCV axes" in name or "OpenGL axes" in name:
+            continue
+        ways, letters = name.split("axes (")
+        turn = np.eye(4)
+        turn[:3, :3] = np.hstack([columns[letter] for letter in letters.rstrip(")").split(", ")])
+        np.testing.assert_allclose(found, (invert_poses(pose) if "inverted" in ways else pose) @ turn)
+        told += 1
+    # All but OpenCV's and OpenGL's, which have names, both ways.
+    assert told == 2 * (24 - 2)
+
+
 @pytest.mark.parametrize(
     ("stored", "into_opencv"),
     [

@@ -32,6 +32,10 @@ class TestImageConfidence:
         nothing = torch.zeros(1, 4, dtype=torch.bool)
         assert image_confidence(~nothing, nothing).tolist() == [1]
 
+    def test_a_single_gaussian_that_both_see_is_all_there_is(self) -> None:
+        one = torch.tensor([[0, 1, 0]]).bool()
+        assert gaussian_iou(one, one).tolist() == gaussian_iou(one, one, "union").tolist() == [1]
+
     @given(seed=st.integers(0, 999), n=st.integers(1, 60))
     def test_bounds(self, seed: int, n: int) -> None:
         generator = torch.Generator().manual_seed(seed)

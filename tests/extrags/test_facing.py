@@ -107,6 +107,24 @@ class TestSides:
         assert bool((faces[len(flat) :] == 0).all())
         assert bool((faces[: len(flat)].abs().sum(dim=1) > 0).any())
 
+    def test_needles_have_no_sides(self) -> None:
+        """Two of their axes are short: around the long one no direction is that of a surface."""
+        needles = _wall(3, (-1, 1), (0.5, 0.5, 0.5))
+        short = needles.scales.min(dim=1, keepdim=True).values
+        scales = torch.cat([short, short + 0.1, short + 2], dim=1)
+        assert bool((_faces(with_facing(Scene(replace(needles, scales=scales)), [_camera(0)])) == 0).all())
+
+    def test_a_view_counts_by_how_well_it_sees(self) -> None:
+        """Two views through a veil say less than one that sees all."""
+        wall, veil = _wall(3, (-1, 1), (0.5, 0.5, 0.5)), _wall(4.5, (-1.5, 1.5), (0.5, 0.5, 0.5))
+        veil = replace(veil, opacities=torch.full_like(veil.opacities, 0.4).logit())
+        beyond = _camera(6, turned=True)
+        alone = _faces(with_facing(Scene(Gaussians.concatenated(wall, veil)), [beyond]))
+        faces = _faces(with_facing(Scene(Gaussians.concatenated(wall, veil)), [beyond, beyond, _camera(0)]))
+        middle = (wall.means[:, :2].abs() < 0.5).all(dim=1)
+        assert bool((alone[: len(wall)][middle, 2] > 0.99).all())
+        assert bool((faces[: len(wall)][middle, 2] < -0.99).all())
+
 
 class TestRendering:
     def test_what_is_seen_from_behind_hides_nothing_and_fills_what_is_empty(
@@ -165,6 +183,17 @@ class TestRendering:
             found, expected = one_sided_rendering(scene, view), scene.render(view)
             assert torch.equal(found.rgb, expected.rgb)
             assert torch.equal(found.depth, expected.depth)
+
+    def test_the_gain_is_that_of_the_view_before_and_behind(self, seen_from_beyond: Scene) -> None:
+        """Half the gain is half the colour, of what stands before as of what fills the gaps behind it."""
+        view = _camera(0)
+        assert seen_from_beyond.facing is not None
+        full, half = (
+            one_sided_rendering(seen_from_beyond, view, exposure=torch.tensor([gain])) for gain in (1.0, 0.5)
+        )
+        torch.testing.assert_close(half.rgb, 0.5 * full.rgb)
+        torch.testing.assert_close(half.alpha, full.alpha)
+        assert float(full.rgb[0, 38, 16, 1]) > 0.5
 
     def test_nothing_but_backs(self, seen_from_beyond: Scene) -> None:
         """Where all of a scene is seen from behind, all of it is shown."""

@@ -109,6 +109,14 @@ def test_what_is_kept(
     assert ("lose no more than 0.1 dB against the coarse scene" in found.reason) == bool(amount)
 
 
+def test_what_loses_as_much_as_it_may_holds() -> None:
+    assert trial(0.0, 0.0, 0.0).holds(0.0)
+    assert trial(1.0, -0.25, 0.0).holds(0.25)
+    assert trial(1.0, 0.5, 0.75).holds(0.25)
+    assert not trial(1.0, 0.5, 0.75).holds(0.125)
+    assert trial(1.0, 0.5, 0.75, paired_error_db=0.125).holds(0.125)
+
+
 def test_why_neither_holds() -> None:
     """Real views alone gained 1.5 dB without a cool-down: virtual ones fall behind that, and gain."""
     alone, behind = trial(0.0, -0.3, -0.3), trial(0.1, 0.5, 1.5)

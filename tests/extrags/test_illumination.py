@@ -109,6 +109,15 @@ class TestNearFieldLight:
         between = (own[0].log() + own[1].log()) / 2
         torch.testing.assert_close(gains, torch.stack([between.exp(), own[2], own[2]]))
 
+    def test_exposures_within_the_second_recording_follow_its_own_frames(self) -> None:
+        train, recording = np.array([8, 0, 2, 6]), np.repeat([0, 1], 5)
+        lamp = replace(light(), log_exposure=torch.tensor([0.4, -0.2, 0.1, -0.5]))
+        own = lamp.exposures().log()
+        frames = np.array([1, 4, 5, 7, 9])
+        expected = [(own[1] + own[2]) / 2, own[2], own[3], (own[3] + own[0]) / 2, own[0]]
+        gains = lamp.interpolated_exposures(frames, train, recording).log()
+        torch.testing.assert_close(gains, torch.stack(expected))
+
     def test_a_highlight_brighter_than_the_picture_leaves_no_albedo(self) -> None:
         start = NearFieldLight.initial(1, 25.0)
         points, normals = torch.tensor([[0.0, 0.0, 20.0]]), torch.tensor([[0.0, 0.0, -1.0]])

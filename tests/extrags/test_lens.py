@@ -7,8 +7,17 @@ import numpy as np
 import PIL.Image  # noqa: F401  (the same)
 import pytest
 
+from extrags.config import IngestConfig
 from extrags.errors import SourceError
-from extrags.lens import LENS_PARAMETERS, Lens, Undistortion, left_out_share, sample_depth
+from extrags.lens import (
+    LENS_PARAMETERS,
+    Lens,
+    Undistortion,
+    left_out_share,
+    pinhole_size,
+    resized_depth,
+    sample_depth,
+)
 
 WIDTH, HEIGHT = 160, 128
 DISTORTION = {
@@ -157,6 +166,23 @@ def test_depth_is_not_mixed_across_a_fold() -> None:
     assert distance.max() < 1e-9
 
 
+def test_beside_a_fold_and_beside_nothing_known_depth_is_that_of_the_nearest_pixel() -> None:
+    depth = np.array([[10, 10, 30, 0], [10, 10, 30, 0]], dtype=np.float32)
+    u = np.array([1.6, 1.9, 2.1, 2.4, 2.9, 3.1])
+    for v in (0.7, 1.0, 1.3):
+        assert sample_depth(depth, u, np.full_like(u, v)).tolist() == [10, 10, 30, 30, 30, 0]
+    # The same down the rows.
+    assert sample_depth(depth.T.copy(), np.full_like(u, 1.3), u).tolist() == [10, 10, 30, 30, 30, 0]
+
+
+@pytest.mark.parametrize(("p1", "p2"), [(0.0, 0.1), (0.0, -0.1), (0.1, 0.0), (-0.1, 0.0)])
+def test_a_fold_on_one_side_is_found(p1: float, p2: float) -> None:
+    """Along one axis a tangential term makes x + 3 p x^2 of x, which falls beyond |x| = 1 / (6 p) there."""
+    lens = Lens("OPENCV", (60.0, 60.0, 80.0, 64.0, 0.0, 0.0, p1, p2), WIDTH, HEIGHT)
+    assert lens.fold_radius(3.0) == pytest.approx(1 / 0.6, abs=0.003)
+    assert lens.fold_radius(1.5) == 1.5
+
+
 def test_a_polynomial_that_folds_back_is_cut_off() -> None:
     folding = Lens("SIMPLE_RADIAL", (60.0, 80.0, 64.0, -0.25), WIDTH, HEIGHT)
     # r (1 - 0.25 r^2) falls from r = sqrt(4 / 3) on.
@@ -193,6 +219,34 @@ def test_a_constant_depth_stays_however_large(value) -> None:
     np.testing.assert_allclose(sample_depth(np.full((3, 4), value), where, where), value, rtol=1e-6)
 
 
+@pytest.mark.parametrize("shape", [(1, 1), (1, 4), (4, 1)])
+def test_depth_one_pixel_wide_is_read_along_its_length(shape: tuple[int, int]) -> None:
+    """Inverse depth is linear between centres, and ends with the outermost ones."""
+    inverse = np.linspace(1.0, 1.03, max(shape))
+    depth = (1 / inverse).reshape(shape)
+    along, across = np.array([0.0, 0.5, 1.0, 1.75, 3.5, 9.0]), np.array([-1.0, 0.0, 0.3, 0.5, 0.9, 9.0])
+    u, v = (along, across) if shape[1] > 1 else (across, along)
+    expected = 1 / np.interp(along, np.arange(max(shape)) + 0.5, inverse)
+    np.testing.assert_allclose(sample_depth(depth, u, v), expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("size", [(16, 12), (32, 24), (64, 48), (24, 36)])
+def test_a_resized_plane_is_the_plane_at_the_new_centres(size: tuple[int, int]) -> None:
+    """Across a picture of any size the inverse depth falls along its width and rises along its height."""
+
+    def plane(width: int, height: int) -> np.ndarray:
+        across, down = (np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height
+        return 1 / (0.1 - 0.03 * across + 0.02 * down[:, None])
+
+    depth = plane(32, 24).astype(np.float32)
+    found = resized_depth(depth, *size)
+    assert found.dtype == np.float32
+    assert found.shape == size[::-1]
+    # Beyond the outermost centres of the source there is no slope.
+    inside = (slice(1, -1), slice(1, -1))
+    np.testing.assert_allclose(found[inside], plane(*size)[inside], rtol=1e-5)
+
+
 def test_what_the_pinhole_leaves_out_is_told_where_the_lens_has_no_pixel_for_some_of_it() -> None:
     """Directions beyond the lens have no place in the source: it was said to leave out nan %."""
     lens = Lens("SIMPLE_DIVISION", (100.0, 80.0, 64.0, 0.6), 160, 128)
@@ -200,3 +254,31 @@ def test_what_the_pinhole_leaves_out_is_told_where_the_lens_has_no_pixel_for_som
     assert not np.isfinite(plan.u[~plan.valid]).all()
     share = left_out_share(lens, plan, np.ones((128, 160), dtype=np.float32))
     assert 0 <= share < 1
+
+
+@pytest.mark.parametrize("times", [1.25, 2.0, 4.0])
+def test_a_narrower_pinhole_leaves_out_what_lies_around_it(times: float) -> None:
+    """With so many times the focal length it shows that share of width and height, in the middle."""
+    lens = Lens("PINHOLE", (100.0, 100.0, 80.0, 64.0), WIDTH, HEIGHT)
+    plan = Undistortion.planned(lens, 2 * np.degrees(np.arctan(WIDTH / 2 / (100 * times))))
+    assert plan.K[0, 0] == pytest.approx(100 * times)
+    picture = np.ones((HEIGHT, WIDTH), dtype=np.float32)
+    assert left_out_share(lens, plan, picture) == pytest.approx(1 - 1 / times**2, abs=1e-6)
+    # A picture of half the size says the same.
+    assert left_out_share(lens, plan, picture[::2, ::2].copy()) == pytest.approx(1 - 1 / times**2, abs=1e-6)
+    # Of a picture that ends before the pinhole does, nothing is left out.
+    inside = np.zeros_like(picture)
+    inside[50:78, 64:96] = 1
+    assert left_out_share(lens, plan, inside) == pytest.approx(0, abs=0.01)
+    assert left_out_share(lens, plan, np.zeros_like(picture)) == 0
+
+
+def test_a_wider_pinhole_grows_to_keep_the_resolution_of_the_centre() -> None:
+    lens = Lens("OPENCV_FISHEYE", (100.0, 81.0, 80.0, 64.0, 0.0, 0.0, 0.0, 0.0), WIDTH, HEIGHT)
+    config = IngestConfig(field_of_view_deg=120.0, size="central")
+    size = pinhole_size(lens, config)
+    # The focal length of square pixels of the same area is 90 px, and 2 * 90 * tan(60 deg) is 311.8.
+    assert size == (312, round(312 * HEIGHT / WIDTH))
+    assert Undistortion.planned(lens, 120.0, size=size).K[0, 0] == pytest.approx(90, rel=2e-3)
+    assert Undistortion.planned(lens).K[0, 0] == pytest.approx(90)
+    assert pinhole_size(lens, IngestConfig(field_of_view_deg=120.0, size="source")) is None

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from extrags.cameras import look_at
+from extrags.cameras import Cameras, look_at
 from extrags.errors import ConfigError
 from extrags.exploration.coverage import (
     coverage_gain,
@@ -128,6 +128,29 @@ class TestViewPairs:
         _, seen = rendered_pairs(scene, square_camera(), **SEEN)
         expected = direction_bin(np.array([[0.0, 0.0, -1.0]]), 32)[0]
         assert seen[0, 0] == np.uint32(1) << np.uint32(expected)
+
+    @pytest.mark.parametrize("per_batch", [1, 2, 16])
+    def test_each_view_covers_what_its_own_mask_leaves(self, per_batch, monkeypatch):
+        """A wall before three cameras in one place, of which each shows another third of its columns."""
+        monkeypatch.setattr("extrags.exploration.coverage.VIEWS_PER_BATCH", per_batch)
+        x, y = (a.ravel() for a in np.meshgrid(np.linspace(-4, 4, 15), np.linspace(-4, 4, 15)))
+        scene = scene_of_points(np.stack([x, y, np.full_like(x, 5.0)], axis=1))
+        camera = square_camera()
+        cameras = Cameras.concatenated([camera] * 3)
+        column = np.arange(camera.width) * 3 // camera.width
+        mask = np.stack([np.tile(column == third, (camera.height, 1)) for third in range(3)])
+
+        def covered(views, masks) -> np.ndarray:
+            return training_coverage(scene, cameras[views], **SEEN, mask=masks) > 0
+
+        whole = covered([0], None)
+        parts = [covered([0], mask[[third]]) for third in range(3)]
+        # Looking along z, x points to the right of the image.
+        assert x[parts[0]].max() < 0 < x[parts[2]].min()
+        np.testing.assert_array_equal(parts[0] | parts[1] | parts[2], whole)
+        np.testing.assert_array_equal(covered([0, 1, 2], mask), whole)
+        np.testing.assert_array_equal(covered([0, 1, 2], mask[[0, 0, 2]]), parts[0] | parts[2])
+        assert not covered([0, 1, 2], np.zeros_like(mask)).any()
 
     def test_training_coverage_is_the_union_of_its_views(self):
         tube = small_tube()

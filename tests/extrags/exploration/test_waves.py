@@ -81,6 +81,16 @@ class TestStartViews:
         cameras = make_tube(n_gaussians=200, n_views=40).cameras
         np.testing.assert_array_equal(start_views(cameras, 9, 30.0)[:4], start_views(cameras, 4, 30.0))
 
+    def test_the_first_is_the_middle_wherever_the_world_begins(self):
+        poses = np.stack([np.eye(4)] * 9)
+        poses[:, 2, 3] = np.arange(9.0)
+        for origin in (0.0, -4.0, 200.0):
+            moved = poses.copy()
+            moved[:, :3, 3] += origin
+            chosen = start_views(Cameras(np.stack([np.eye(3)] * 9), moved, 8, 8), 3, 10.0)
+            assert chosen[0] == 4
+            assert sorted(chosen.tolist()) == [0, 4, 8]
+
     @pytest.mark.parametrize("n_views", [1, 2, 7])
     def test_fewer_views_than_starts(self, n_views):
         cameras = make_tube(n_gaussians=200, n_views=n_views).cameras
@@ -117,6 +127,18 @@ class TestSearchStarts:
     def test_pairs_have_as_many_as_trajectories(self):
         cameras = make_tube(n_gaussians=200, n_views=40).cameras
         assert len(search_starts(cameras, ExploreConfig(trajectories=2, score="pairs"), 30.0)) == 2
+
+
+class TestLeast:
+    def test_exactly_enough_is_enough_and_nothing_never_is(self):
+        # A start and two virtual views.
+        branch = made_branch(0, np.array([7, 0, 0, 0], np.uint32), length=3)
+        for least in (Least(3.0), Least(per_view=1.5), Least(2.0, per_view=1.5), Least(3.0, per_view=1.0)):
+            assert least.of(branch) == 3.0
+            assert least.accepts(branch, 3.0)
+            assert not least.accepts(branch, np.nextafter(3.0, 0))
+        assert Least().accepts(branch, np.nextafter(0.0, 1))
+        assert not Least().accepts(branch, 0.0)
 
 
 class TestMergeWave:

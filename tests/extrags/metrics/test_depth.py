@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -25,6 +27,19 @@ def test_delta_takes_the_ratio_either_way() -> None:
     errors = depth_errors(np.array([[12.4, 12.6, 8.1, 7.9]]), truth)
     assert errors is not None
     assert errors.delta125 == 0.5
+    at_the_limit = depth_errors(np.array([[12.5, 8.0, 10.0, 10.0]]), truth)
+    assert at_the_limit is not None
+    assert at_the_limit.delta125 == 0.5
+
+
+@pytest.mark.parametrize("unit", [2.0**-12, 2.0**12])
+def test_shares_do_not_depend_on_the_unit(unit: float) -> None:
+    truth = np.array([[10.0, 20.0, 0.0, np.nan, 40.0]])
+    found = np.array([[11.0, 30.0, 5.0, 5.0, 0.0]])
+    errors, scaled = depth_errors(found, truth), depth_errors(found * unit, truth * unit)
+    assert errors is not None
+    assert errors.rmse is not None
+    assert scaled == replace(errors, rmse=errors.rmse * unit)
 
 
 def test_nothing_to_compare_has_no_value() -> None:

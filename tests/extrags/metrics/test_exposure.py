@@ -46,6 +46,20 @@ def test_holes_and_masked_pixels_take_no_part() -> None:
     mask = torch.ones(8, 9, dtype=torch.bool)
     mask[6:] = False
     assert exposure_gain(render, target, mask).item() == pytest.approx(2, rel=1e-5)
+    # Nor does what is not known of the truth.
+    assert exposure_gain(target, render, mask).item() == pytest.approx(
+        float((0.5 * target[3:6].square()).sum() / target[:6].square().sum()), rel=1e-5
+    )
+
+
+def test_what_the_gain_makes_too_bright_ends_at_one() -> None:
+    render = torch.tensor([0.1, 0.2, 0.3, 0.8])[None, :, None].expand(5, 4, 3)
+    target = (2 * render).clamp(max=1)
+    gain = exposure_gain(render, target).item()
+    assert 1 < gain < 2
+    expected = torch.tensor([0.1 * gain, 0.2 * gain, 0.3 * gain, 1.0])[None, :, None].expand(5, 4, 3)
+    assert 0.8 * gain > 1
+    torch.testing.assert_close(align_exposure(render, target), expected)
 
 
 def test_never_worse_in_squared_error_before_clipping() -> None:

@@ -129,6 +129,36 @@ def test_rpe_counts_drift_per_step() -> None:
     )
 
 
+@pytest.mark.parametrize("apart", [1, 3])
+def test_rpe_is_measured_in_the_camera_that_moves(apart: int) -> None:
+    """Of cameras that turn: where each of them is told the later one stands, and where it does stand."""
+    truth, other = trajectory(9, seed=1), trajectory(9, seed=2)
+
+    def told(poses: np.ndarray) -> np.ndarray:
+        steps = poses[apart:, :3, 3] - poses[:-apart, :3, 3]
+        return np.einsum("nji,nj->ni", poses[:-apart, :3, :3], steps)
+
+    def turns(poses: np.ndarray) -> Rotation:
+        before, after = (Rotation.from_matrix(part[:, :3, :3]) for part in (poses[:-apart], poses[apart:]))
+        return before.inv() * after
+
+    errors = relative_pose_error(other, truth, frames_apart=apart, alignment="none")
+    missed = np.linalg.norm(told(other) - told(truth), axis=1)
+    assert errors.translation_rmse == pytest.approx(np.sqrt(np.mean(missed**2)))
+    angles = np.degrees((turns(truth).inv() * turns(other)).magnitude())
+    assert errors.rotation_rmse_deg == pytest.approx(np.sqrt(np.mean(angles**2)))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_points_without_a_place_cannot_be_aligned(value: float) -> None:
+    points = np.random.default_rng(0).normal(size=(5, 3))
+    broken = points.copy()
+    broken[3, 1] = value
+    for name, pair in (("source", (broken, points)), ("target", (points, broken))):
+        with pytest.raises(NonFiniteError, match=f"the {name} points"):
+            umeyama(*pair)
+
+
 def test_bad_input_is_named() -> None:
     truth = trajectory(4)
     broken = truth.copy()

@@ -85,6 +85,34 @@ class TestVerdicts:
         (row,) = [row for row in found["rows"] if row["quantity"] == "seconds"]
         assert (row["paired"], row["verdict"]) == (False, "worse")
 
+    def test_one_seed_in_common_makes_no_pairs_of_several(self) -> None:
+        for sides in ((range(3), range(1)), (range(1), range(3))):
+            before, after = (result(seeds=seeds) for seeds in sides)
+            (row,) = [row for row in compare_results(before, after)["rows"] if row["quantity"] == "psnr"]
+            assert (row["paired"], row["n"], row["verdict"]) == (False, 1, "not judged")
+            for side, mean in ((before, row["before"]), (after, row["after"])):
+                figures_of_all = [case["metrics"]["psnr"] for case in side["cases"]]
+                assert mean == pytest.approx(np.mean(figures_of_all))
+
+    def test_costs_change_by_factors(self) -> None:
+        """Twice as long on one seed and half as long on another are no change, however long each takes."""
+        before, after = result(seeds=range(4)), result(seeds=range(4))
+        for case, was, factor in zip(before["cases"], (10, 1000, 30, 70), (2, 0.5, 3, 1 / 3), strict=True):
+            case["seconds"] = was
+            after["cases"][case["seed"]]["seconds"] = was * factor
+        (row,) = [row for row in compare_results(before, after)["rows"] if row["quantity"] == "seconds"]
+        assert row["worsening"] == pytest.approx(0, abs=1e-12)
+        low, high = row["interval"]
+        assert (1 + low) * (1 + high) == pytest.approx(1)
+
+    def test_a_cost_of_nothing_has_no_factor(self) -> None:
+        before, after = result(noise=0.0), result(noise=0.0)
+        before["cases"][0]["seconds"] = 0.0
+        for one, other, change in ((before, after, 0.25), (after, before, -0.2)):
+            (row,) = [row for row in compare_results(one, other)["rows"] if row["quantity"] == "seconds"]
+            assert row["worsening"] == pytest.approx(change)
+            assert np.isfinite(row["interval"]).all()
+
     def test_times_of_other_machines_are_not_judged(self) -> None:
         found = compare_results(result(), result(slower=9, machine={"processor": "another"}))
         assert not found["times_judged"]
@@ -504,6 +532,7 @@ def _with(**changes: Any) -> dict[str, Any]:
         {"cases": []},
         {"cases": [1]},
         {"cases": [{"method": "coarse"}]},
+        {"cases": [*result()["cases"], {"method": "coarse"}]},
         {**result(), "machine": "x"},
         {**result(), "methods": ["x"]},
         _with(sequence=["phantom/0"]),

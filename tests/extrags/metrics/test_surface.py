@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -139,6 +139,11 @@ class TestWholeSurfaces:
         assert errors.completeness_mm is None
         assert errors.precision is None
 
+    @pytest.mark.parametrize("nothing", [EMPTY, LINE], ids=["no triangle", "no area"])
+    def test_against_nothing_nothing_is_measured(self, nothing: Mesh) -> None:
+        errors = surface_errors(rectangle((0, 0), (1, 1), 0), nothing, 1.0)
+        assert set(asdict(errors).values()) == {None}
+
     def test_a_threshold_must_be_a_length(self) -> None:
         with pytest.raises(ConfigError, match="above zero"):
             surface_errors(EMPTY, EMPTY, 0.0)
@@ -230,6 +235,23 @@ class TestObserved:
         points = np.array([[-9.0, 0, WALL_MM], [1.0, 0, WALL_MM], [-6.0, 0, 10]])
         hidden = joined(WALL, shield)
         assert seen_by(points, hidden, cameras, mask, np.inf).tolist() == [False, True, True]
+
+    def test_seen_is_what_any_of_several_cameras_sees(self, sequence: EndoscopicSequence) -> None:
+        """Each looks from its own place, past its own side of a shield, through its own mask."""
+        shield = rectangle((-1, -30), (1, 30), 10)
+        points = np.array([[-10.0, 0, WALL_MM], [10.0, 0, WALL_MM], [4.0, 0, WALL_MM], [-4.0, 0, WALL_MM]])
+        hidden, mask = joined(WALL, shield), sequence.mask.copy()
+
+        def seen(views: list[int]) -> list[bool]:
+            found = seen_by(points, hidden, sequence.cameras[views], mask[views], np.inf)
+            return [bool(flag) for flag in found]
+
+        # From x = -4 the shield hides the wall from 2 to 6 mm, from x = 4 the other side.
+        assert seen([0]) == [True, False, False, True]
+        assert seen([1]) == [False, True, True, False]
+        assert seen([0, 1]) == seen([1, 0]) == [True] * 4
+        mask[1] = False
+        assert seen([0, 1]) == [True, False, False, True]
 
     def test_masked_and_far_surface_is_not_seen(self, sequence: EndoscopicSequence) -> None:
         cameras, mask = sequence.cameras[[0]], sequence.mask[[0]].copy()

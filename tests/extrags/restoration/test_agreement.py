@@ -6,7 +6,7 @@ import torch
 
 from extrags.cameras import Cameras
 from extrags.errors import ShapeError
-from extrags.restoration.agreement import agreed_views
+from extrags.restoration.agreement import agreed_views, feathered_invented_share
 from extrags.restoration.benchmark.evaluation import held_out_clips
 from extrags.restoration.benchmark.variants import Agreed, AsRendered
 from extrags.restoration.protocol import Clip, Restoration
@@ -54,6 +54,19 @@ class TestAgreedViews:
         before, after = (rgb[0] - rgb[1])[middle].abs().mean(), (found[0] - found[1])[middle].abs().mean()
         assert after < 0.3 * before
         assert found[middle].mean() == pytest.approx(0.4, abs=0.01)
+
+    @pytest.mark.parametrize("unknown", [0.5, 0.7, 1.0])
+    def test_a_view_follows_by_the_share_that_is_invented(self, unknown: float) -> None:
+        """Two views in one place that know as little: each goes half of the way, times that share."""
+        unconfirmed = torch.full((2, *SIZE), unknown)
+        share = feathered_invented_share(unconfirmed)
+        assert float(share.max() - share.min()) < 1e-6
+        assert 0 < float(share.mean()) <= 1
+        rgb = painted([0.3, 0.5])
+        found = agreed(rgb, plane_views([0.0, 0.0]), unconfirmed=unconfirmed)
+        expected = rgb + share * 0.5 * (rgb.flip(0) - rgb)
+        middle = (..., slice(14, 18), slice(22, 26))
+        torch.testing.assert_close(found[middle], expected[middle], atol=2e-3, rtol=0)
 
     def test_another_surface_is_not_followed(self) -> None:
         depth = torch.full((2, *SIZE), DEPTH_MM)
@@ -107,6 +120,15 @@ class TestAgreedViews:
         assert torch.equal(agreed(rgb[:1], plane_views([0.0])), rgb[:1])
         nothing = torch.zeros(2, *SIZE)
         assert torch.equal(agreed(rgb, plane_views([0.0, 0.5]), unconfirmed=nothing), rgb)
+
+    def test_a_view_without_holes_leads_the_others(self) -> None:
+        rgb = painted([0.3, 0.5])
+        unconfirmed = torch.ones(2, *SIZE)
+        unconfirmed[0] = 0
+        found = agreed(rgb, plane_views([0.0, 0.0]), unconfirmed=unconfirmed)
+        assert torch.equal(found[0], rgb[0])
+        middle = (..., slice(14, 18), slice(22, 26))
+        assert found[1][middle].mean() < 0.4
 
     def test_parts_must_fit(self) -> None:
         with pytest.raises(ShapeError, match="different lengths"):

@@ -192,6 +192,23 @@ class TestDefaultStrategy:
         assert sizes == [4, 4, 4, 4, 5, 5, 6, 6, 6]
         assert len(adam.first_moments["quats"]) == len(adam.steps) == sizes[-1]
 
+    @pytest.mark.parametrize("cloned", [[], [3]])
+    def test_a_step_takes_faint_gaussians_out_of_the_optimiser(self, cloned: list[int]) -> None:
+        """Whether others are new or not; those that stay keep parameters and moments."""
+        values = small_ones(5)
+        values["opacities"][[0, 2]] = -8.0
+        parameters = {name: value.clone().requires_grad_() for name, value in values.items()}
+        adam = SelectiveAdam(parameters, dict.fromkeys(parameters, 1e-3))
+        adam.first_moments["means"] += torch.arange(5.0)[:, None]
+        density = strategy(5, every=1, start_share=0.0)
+        density.step(adam, strong(5, cloned), 0)
+        rows = [1, 3, 4]
+        for name, value in adam.parameters.items():
+            assert torch.equal(value.detach(), values[name][rows + cloned])
+        moments = adam.first_moments["means"][:, 0].tolist()
+        assert moments == [1.0, 3.0, 4.0, *(0.0 for _ in cloned)]
+        assert len(adam.steps) == 3 + len(cloned)
+
     def test_reset_caps_opacities_and_pauses(self) -> None:
         parameters = {k: v.requires_grad_() for k, v in small_ones(4).items()}
         adam = SelectiveAdam(parameters, dict.fromkeys(parameters, 1e-3))

@@ -84,4 +84,17 @@ class TestHarmonics:
         assert schedule.sh_degree_at(1200, 1) == 1
 
     def test_all_are_active_from_the_first_step_where_a_scene_exists(self) -> None:
-        assert schedule_with(None).resumed(seed=1).sh_degree_at(0, 3) == 3
+        resumed = schedule_with(None).resumed(seed=7)
+        assert resumed.sh_degree_at(0, 3) == 3
+        # Drawn anew: not the views of the first steps once more.
+        assert resumed.seed == 7 != schedule_with(None).seed
+
+
+class TestProgress:
+    def test_it_ends_with_the_last_iteration_of_the_last_round(self) -> None:
+        alone = schedule_with(None)
+        last = alone.progress(alone.iterations - 1, {"loss": 0.5})
+        assert (last.stage, last.done, last.total, last.values) == ("coarse", 1000, 1000, {"loss": 0.5})
+        second = replace(alone, iterations_before=300, iterations_after=200)
+        first = second.progress(0, {})
+        assert (first.done, first.total) == (301, 1500)

@@ -9,7 +9,13 @@ from torch import Tensor
 
 from extrags.cameras import Cameras, pixel_rays, pose_distances
 from extrags.view_synthesis.references import LightTransfer, ReferenceViews
-from extrags.view_synthesis.warp import covisibility, depth_normals, fit_falloff_exponent, warp_references
+from extrags.view_synthesis.warp import (
+    covisibility,
+    depth_normals,
+    fit_falloff_exponent,
+    seen_by_others,
+    warp_references,
+)
 from tests.extrags.lit_tube import cast_tube, exact_references, tube_cameras, tube_light
 
 
@@ -80,8 +86,12 @@ def test_surface_hidden_from_a_reference_is_not_borrowed() -> None:
     references = exact_references(tube_cameras(8), light)
     references.packed[:, 4] *= 2  # something stands at half the distance in every reference
     warped = warp_references(references, cameras, depth, count=4)
-    assert warped.blend_weight.max() == 0
-    assert warped.blend.abs().max() == 0
+    for weight, shown in (
+        (warped.blend_weight, warped.blend),
+        (warped.nearest_weight, warped.nearest),
+    ):
+        assert weight.max() == 0
+        assert shown.abs().max() == 0
 
 
 def test_the_best_reference_is_the_view_itself() -> None:
@@ -290,6 +300,55 @@ def test_the_exponent_is_found_in_spite_of_what_shows_another_brightness() -> No
     # Something darkens the lower third of every second view.
     references.packed[::2, :3, 32:] *= 0.5
     assert abs(fit_falloff_exponent(references) - 0.8) < 0.12
+
+
+def test_the_exponent_is_found_in_spite_of_pixels_that_are_too_bright_or_too_dark() -> None:
+    """A floor of noise and the end of what a sensor tells have one brightness at whatever distance."""
+    references = _fading_references(1.3)
+    luminance = references.packed[:, :3].mean(dim=1)
+    for chosen, value in (
+        (luminance < luminance.quantile(0.3), 0.05),
+        (luminance > luminance.quantile(0.7), 0.95),
+    ):
+        references.packed[:, :3].masked_fill_(chosen[:, None], value)
+    assert abs(fit_falloff_exponent(references) - 1.3) < 0.12
+
+
+def test_two_views_are_enough_for_an_exponent_and_one_is_not() -> None:
+    references = _fading_references(0.8)
+    assert abs(fit_falloff_exponent(references.subset(np.array([2, 4]))) - 0.8) < 0.12
+    assert fit_falloff_exponent(references.subset(np.array([2]))) == 0.0
+
+
+def test_views_that_are_not_trusted_tell_no_exponent() -> None:
+    references = _fading_references(0.8)
+    # Views are compared with the next one, and with the third after them.
+    references.packed[1::2, 3] = 0
+    assert fit_falloff_exponent(references) == 0.0
+
+
+def test_other_views_weigh_by_trust_and_by_how_much_alike_they_look() -> None:
+    """The view itself weighs what it is trusted; others less, the less the farther away they stand."""
+    cameras = tube_cameras(4)[[0, 0, 1, 2, 3]]
+    references = exact_references(cameras, None)
+    references.packed[:, 3] = 1
+    references.packed[1, 3] = 0.5
+    rgb, weight = seen_by_others(
+        references,
+        cameras[[0]],
+        1 / references.packed[0, 4:5],
+        torch.arange(5),
+        gain=torch.ones(()),
+        depth_tolerance=0.05,
+    )
+    torch.testing.assert_close(weight[0], torch.ones_like(weight[0]), atol=1e-3, rtol=0)
+    torch.testing.assert_close(weight[1], 0.5 * weight[0], atol=1e-3, rtol=0)
+    assert weight.max() <= 1
+    means = weight.mean(dim=(1, 2))
+    assert means[0] > means[2] > means[3] > means[4]
+    known = (weight[2:] > 0.3)[:, None].expand(-1, 3, -1, -1)
+    assert known.float().mean() > 0.1
+    assert float((rgb[2:] - references.packed[0, :3]).abs()[known].mean()) < 5e-3
 
 
 def test_chosen_references_keep_what_is_theirs() -> None:
