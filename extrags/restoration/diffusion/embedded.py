@@ -214,11 +214,12 @@ class EmbeddedEnhancer:
             noise = self.noise(size, clip.index, index)
             draws.append(self.restored_layers(clip.layers, clip.transfer, noise, steps=self.steps))
         colors = torch.stack([draw.rgb for draw in draws])
-        spread = colors.std(dim=0, correction=0).mean(dim=1, keepdim=True)
         # The mean of drawn views would have no texture: the others only tell how far views may differ.
         shown = colors[0] if self.drawing else colors.mean(dim=0)
         error = torch.stack([draw.error for draw in draws]).mean(dim=0)
-        expected = torch.hypot(error, spread)[:, 0].contiguous().numpy()
+        if len(draws) > 1:
+            error = torch.hypot(error, colors.std(dim=0, correction=0).mean(dim=1, keepdim=True))
+        expected = error[:, 0].contiguous().numpy()
         return Restoration(
             shown.permute(0, 2, 3, 1).contiguous().numpy(),
             self.calibration.applied(expected) * self.modesty,
