@@ -61,6 +61,8 @@ _OTHER_IMAGES = (
     *(".dng", ".npy", ".npz"),
 )
 """Images that are not read as frames."""
+_FOLDERS_ABOVE = 3
+"""So far above a file its sequence is looked for: `sparse/0/cameras.bin`."""
 _NAMED_FILES = 5
 """So many of the files between which a user has to choose are named."""
 
@@ -157,6 +159,23 @@ def _named_sets() -> tuple[Descriptor, ...]:
     return tuple(item for reader in readers() for item in reader.named_sets)
 
 
+def _folder_to_give(file: Path) -> str:
+    """Names the folder whose picture, model or `transforms.json` was given; empty where there is none."""
+    if not file.is_file():
+        return ""
+    above = list(file.absolute().parents)[:_FOLDERS_ABOVE]
+    plain = (video.READER, dicom.READER, frames_folder.READER)
+    posed = tuple(reader for reader in readers() if reader not in plain)
+    # From above: folders of pictures, and of a COLMAP model, lie within the one that is read.
+    searched = [(folder, posed) for folder in reversed(above)]
+    if file.suffix.lower() in COLOR_SUFFIXES:
+        searched += [(folder, (frames_folder.READER,)) for folder in above]
+    for folder, kind in searched:
+        if any(reader.recognises(folder) for reader in kind):
+            return f"; give the folder {folder}"
+    return ""
+
+
 def _recognised(path: Path) -> FolderReader:
     for reader in readers():
         if reader.recognises(path):
@@ -164,7 +183,8 @@ def _recognised(path: Path) -> FolderReader:
     if not path.is_dir():
         raise SourceError(
             "this is a file; expected a folder that holds a sequence, a video "
-            f"({', '.join(VIDEO_SUFFIXES)}) or a DICOM file ({', '.join(DICOM_SUFFIXES)})",
+            f"({', '.join(VIDEO_SUFFIXES)}) or a DICOM file ({', '.join(DICOM_SUFFIXES)})"
+            f"{_folder_to_give(path)}",
             file=path,
         )
     for kind, suffixes in (("videos", VIDEO_SUFFIXES), ("DICOM files", DICOM_SUFFIXES)):

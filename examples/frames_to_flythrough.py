@@ -41,6 +41,8 @@ def flythrough(
 
 
 if __name__ == "__main__":
-    if len(sys.argv) != 3:
+    if len(sys.argv) != 3 or not sys.argv[2].lower().endswith(".gif"):
         sys.exit(__doc__)
-    flythrough(*reconstructed(sys.argv[1], extrags.PROFILES["quick"]), Path(sys.argv[2]))
+    target = Path(sys.argv[2])
+    target.parent.mkdir(parents=True, exist_ok=True)  # not after all the work
+    flythrough(*reconstructed(sys.argv[1], extrags.PROFILES["quick"]), target)

@@ -53,4 +53,6 @@ def main(file: Path, scene: int = 11, config: PhantomConfig | None = None) -> No
 
 
 if __name__ == "__main__":
+    if len(sys.argv) not in (2, 3) or not all(number.isdecimal() for number in sys.argv[2:]):
+        sys.exit(__doc__)
     main(Path(sys.argv[1]), *map(int, sys.argv[2:3]))

@@ -13,6 +13,7 @@ import extrags
 
 def whole_job(source: str, ply: Path, config: extrags.PipelineConfig) -> extrags.Result:
     """Take a source through all stages, write the final scene, and print what was decided and reached."""
+    ply.parent.mkdir(parents=True, exist_ok=True)  # not after all the work
     result = extrags.run_pipeline(extrags.read(source, config.ingest), config)
     result.scene.gaussians.write_ply(ply)
     for stage, reason in result.skipped.items():

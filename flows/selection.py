@@ -120,7 +120,9 @@ def _manifest(file: Path) -> Iterator[Chosen]:
     try:
         # Editors of some systems begin a file with a byte-order mark.
         text = file.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
+    except OSError as error:
+        raise ConfigError(f"the manifest {file} cannot be read: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
         raise ConfigError(f"the manifest {file} cannot be read: {error}") from error
     suffix = file.suffix.lower()
     if suffix not in (".yaml", ".yml", ".json"):

@@ -7,12 +7,14 @@ from collections.abc import Iterable
 from typing import Any
 
 from rich.console import Console, ConsoleOptions, RenderableType
+from rich.measure import Measurement
 from rich.segment import Segment
+from rich.table import Table
 from rich.text import Text
 
 from flows.printable import printable
 
-__all__ = ["console"]
+__all__ = ["console", "print_table"]
 
 FILE_WIDTH = 200
 """Width, in columns, of tables that are written to a file or a pipe."""
@@ -46,3 +48,24 @@ def console(*, error: bool = False) -> Console:
     width = None if stream.isatty() else FILE_WIDTH
     # Without emoji: names may have `:a:` in them.
     return _Console(stderr=error, width=width, highlight=False, emoji=False)
+
+
+def print_table(out: Console, table: Table) -> None:
+    """Print a table; where the terminal is too narrow for its words, each row as a line with all cells.
+
+    rich shortens names with an ellipsis there, or leaves columns out; names and keys are there to be copied.
+
+    Args:
+        out: where to.
+        table: the first column names the row.
+    """
+    needed = Measurement.get(out, out.options.update(max_width=10_000), table).minimum
+    if needed <= out.width:
+        out.print(table)
+        return
+    if table.title:
+        out.print(table.title, soft_wrap=True)
+    heads = [str(column.header) for column in table.columns]
+    for name, *cells in zip(*(column.cells for column in table.columns), strict=True):
+        told = ", ".join(f"{head} {cell}" for head, cell in zip(heads[1:], cells, strict=True) if cell)
+        out.print(f"{name}: {told}" if told else name, soft_wrap=True)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import importlib.util
+import runpy
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -53,6 +55,39 @@ def test_every_example_is_tested() -> None:
     tested = Path(__file__).read_text(encoding="utf-8")
     for file in EXAMPLES.glob("*.py"):
         assert f'example("{file.stem}")' in tested, f"{file.name} has no test"
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments"),
+    [
+        *((file.stem, given) for file in sorted(EXAMPLES.glob("*.py")) for given in ([], 4 * ["x"])),
+        ("video_of_a_phantom", ["exam.mp4", "three"]),
+        ("frames_to_flythrough", ["frames/", "way.mp4"]),
+    ],
+)
+def test_wrong_arguments_show_the_right_ones(
+    name: str, arguments: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.argv", ["", *arguments])
+    with pytest.raises(SystemExit, match=f"python examples/{name}.py"):
+        runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name="__main__")
+
+
+@pytest.mark.parametrize(
+    ("name", "target", "begins"),
+    [("whole_job", "scene.ply", "extrags.run_pipeline"), ("frames_to_flythrough", "way.gif", "extrags.read")],
+)
+def test_the_folder_of_the_result_is_there_before_the_work(
+    name: str, target: str, begins: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It was missed after all stages, and the scene was lost."""
+    monkeypatch.setattr(begins, Mock(side_effect=InterruptedError))
+    monkeypatch.setattr("sys.argv", ["", SEQUENCE, str(tmp_path / "results" / target)])
+    if name == "whole_job":
+        monkeypatch.setattr("extrags.read", Mock())
+    with pytest.raises(InterruptedError):
+        runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name="__main__")
+    assert (tmp_path / "results").is_dir()
 
 
 class TestWholeJob:

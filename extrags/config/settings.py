@@ -199,7 +199,8 @@ def unknown_setting(name: str, known: Iterable[str]) -> ConfigError:
     inside = [other.removeprefix(f"{name}.") for other in known if other.startswith(f"{name}.")]
     if inside:
         return ConfigError(f"{name} is a group of settings; name one of {', '.join(inside)}")
-    meant = did_you_mean(name, known)
+    within = {other[:dot] for other in known for dot, letter in enumerate(other) if letter == "."}
+    meant = did_you_mean(name, [*known, *sorted(within)])
     # Groups first, then what is set for the whole.
     grouped = sorted(known, key=lambda other: "." not in other)
     groups = ", ".join(dict.fromkeys(other.partition(".")[0] for other in grouped))

@@ -99,8 +99,10 @@ def read_camera_path(file: Path) -> CameraPath:
         entries = content["camera_path"]
         if not isinstance(entries, list):
             raise TypeError("camera_path is no list")
-    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
-        raise SourceError(f"no camera path: {type(error).__name__}: {error}", file=file) from error
+    except KeyError as error:
+        raise SourceError("no camera path: the field is missing", file=file, field=error.args[0]) from error
+    except (ValueError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+        raise SourceError(f"no camera path: {error}", file=file) from error
     if kind != _PINHOLE:
         raise SourceError(
             f"{json.dumps(kind)[:80]}; expected {_PINHOLE}: other cameras are not rendered",
@@ -123,10 +125,10 @@ def _camera(entry: Any, index: int, width: int, height: int, file: Path) -> tupl
         matrix = np.array(entry["camera_to_world"], dtype=np.float64).reshape(4, 4)
         given = np.array(entry["K"], dtype=np.float64).reshape(3, 3) if "K" in entry else None
         fov_deg = float(entry["fov"]) if given is None else math.nan
-    except (ValueError, KeyError, TypeError, OverflowError) as error:
-        raise SourceError(
-            f"{type(error).__name__}: {error}", file=file, frame=index, field="camera_path"
-        ) from error
+    except KeyError as error:
+        raise SourceError("the field is missing", file=file, frame=index, field=error.args[0]) from error
+    except (ValueError, TypeError, OverflowError) as error:
+        raise SourceError(str(error), file=file, frame=index, field="camera_path") from error
     if given is None:
         if not 0 < fov_deg < _WIDEST_FOV_DEG:
             raise SourceError(

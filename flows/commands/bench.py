@@ -358,14 +358,14 @@ def _print(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from flows.terminal import console
+    from flows.terminal import console, print_table
 
     table = Table(box=None, pad_edge=False, header_style="bold")
     for name in header:
         table.add_column(name)
     for row in rows:
         table.add_row(*(escape(_text(value)) for value in row))
-    console().print(table)
+    print_table(console(), table)
 
 
 def _text(value: Any) -> str:

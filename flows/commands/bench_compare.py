@@ -50,7 +50,9 @@ def compare(given: argparse.Namespace) -> int:
 def _read(path: Path) -> dict[str, Any]:
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except OSError as error:
+        raise ConfigError(f"{path} cannot be read: {error.strerror or error}") from error
+    except ValueError as error:
         raise ConfigError(f"{path} is no JSON that can be read: {error}") from error
     if not isinstance(found, dict):
         raise ConfigError(f"{path} is no result of a benchmark: expected a JSON object")
@@ -61,7 +63,7 @@ def _print(found: dict[str, Any], *, every: bool) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from flows.terminal import console
+    from flows.terminal import console, print_table
 
     table = Table(box=None, pad_edge=False, header_style="bold")
     for name in ("sequence", "method", "budget", "quantity", "before", "after", "worse by", "n", "verdict"):
@@ -86,7 +88,7 @@ def _print(found: dict[str, Any], *, every: bool) -> None:
             )
     out = console()
     if table.rows:
-        out.print(table)
+        print_table(out, table)
     for line in (*found["failed"], *found["missing"]):
         out.print(line, markup=False, soft_wrap=True)
     for line in found["other_settings"]:

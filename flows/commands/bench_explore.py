@@ -122,7 +122,7 @@ def _print(found: dict[str, Any]) -> None:
     """A table per sequence and seed: a row per way, figures at each number of views."""
     from rich.table import Table
 
-    from flows.terminal import console
+    from flows.terminal import console, print_table
 
     out = console()
     counts = [str(count) for count in found["views"]]
@@ -149,7 +149,7 @@ def _print(found: dict[str, Any]) -> None:
                 figures = case["end_use"][count]
                 row.append(", ".join(_db(figures[group]["psnr"]) for group in ("whole", "unobserved")))
             table.add_row(*row)
-        out.print(table)
+        print_table(out, table)
 
 
 def _percent(share: float | None) -> str:

@@ -104,7 +104,7 @@ def _print_table(rows: list[dict[str, Any]]) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from flows.terminal import console
+    from flows.terminal import console, print_table
 
     table = Table(box=None, pad_edge=False, header_style="bold")
     for name in ("part", "case", "measured", "worst", "limit", "pass", "where", "trials", "s"):
@@ -123,6 +123,6 @@ def _print_table(rows: list[dict[str, Any]]) -> None:
             str(row["trials"]),
             f"{row['seconds']:.1f}",
         )
-    console().print(table)
+    print_table(console(), table)
     failed = sum(not row["passed"] for row in rows)
     console().print(f"{len(rows)} rows, {failed} of them fail" if failed else f"all {len(rows)} rows pass")

@@ -214,7 +214,7 @@ def print_benchmark(found: dict[str, Any], *, to_stderr: bool) -> None:
     from rich.markup import escape
 
     from flows.tables import difference_figures, difference_text, spread_text, table_figures
-    from flows.terminal import console
+    from flows.terminal import console, print_table
 
     out = console(error=to_stderr)
     comparison = found["comparison"]
@@ -232,7 +232,7 @@ def print_benchmark(found: dict[str, Any], *, to_stderr: bool) -> None:
                 *map(escape, about),
                 *(difference_text(name, row["figures"].get(name)) for name in differences),
             )
-        out.print(table)
+        print_table(out, table)
     table = _table("mean ± standard deviation over seeds")
     for column in ("sequence", "profile", "method", "seeds", *columns):
         table.add_column(column)
@@ -241,7 +241,7 @@ def print_benchmark(found: dict[str, Any], *, to_stderr: bool) -> None:
         figures = (spread_text(metric, row["figures"].get(metric)) for metric in columns)
         about = (name, row["profile"], row["method"], str(row["n_seeds"]))
         table.add_row(*map(escape, about), *figures)
-    out.print(table)
+    print_table(out, table)
     for words in found["regressions"]:
         out.print(f"[red]worse: {escape(words)}[/]")
     for case in found["cases"]:

@@ -94,7 +94,7 @@ def ls(given: argparse.Namespace) -> int:
     from rich.markup import escape
     from rich.table import Table
 
-    from flows.terminal import console
+    from flows.terminal import console, print_table
 
     store = _looked_into(given)
     manifests = [item for pattern in _spellings(given.pattern) for item in store.ls(pattern)]
@@ -115,7 +115,7 @@ def ls(given: argparse.Namespace) -> int:
             names = (escape(item.stage), escape(item.label), escape(item.started[:16]))
             table.add_row(*names, *cost, escape(item.key) + mark)
         out = console()
-        out.print(table)
+        print_table(out, table)
         total = size_text(sum(item.bytes for item in manifests))
         out.print(f"{counted(len(manifests), 'artefact')}, {total}, in {store.root}", markup=False)
     rows = [
@@ -136,7 +136,7 @@ def verify(given: argparse.Namespace) -> int:
     from rich.table import Table
 
     from extrags.store.manifest import stage_of
-    from flows.terminal import console
+    from flows.terminal import console, print_table
 
     store = _looked_into(given)
     keys = store.keys()
@@ -155,7 +155,7 @@ def verify(given: argparse.Namespace) -> int:
                 table.add_row(*map(escape, cells))
             for key, problem in unreadable.items():
                 table.add_row(*map(escape, (stage_of(key), problem, key)))
-            out.print(table)
+            print_table(out, table)
         out.print(f"{len(damaged)} of {len(keys)} artefacts damaged in {store.root}", markup=False)
         if unreadable:
             # They may be whole: whoever may read them can tell.
@@ -202,7 +202,9 @@ def _examined(store: Store, keys: Collection[str]) -> tuple[list[DamagedArtefact
     from flows.terminal import console
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    bars = Progress(*columns, console=console(error=True), transient=True, disable=not sys.stderr.isatty())
+    bars = Progress(
+        *columns, console=console(error=True), transient=True, disable=not (keys and sys.stderr.isatty())
+    )
     damaged: list[DamagedArtefactError] = []
     unreadable: dict[str, str] = {}
     with bars:
@@ -276,7 +278,7 @@ def usage(given: argparse.Namespace) -> int:
     from rich.table import Table
 
     from extrags.store.retention import usage as usage_of
-    from flows.terminal import console
+    from flows.terminal import console, print_table
 
     store = _looked_into(given)
     rows = usage_of(store)
@@ -291,7 +293,7 @@ def usage(given: argparse.Namespace) -> int:
             numbers = (str(row.artefacts), str(row.files), size_text(row.bytes))
             table.add_row(escape(row.sequence), *numbers, row.made[:16], row.used[:16])
         out = console()
-        out.print(table)
+        print_table(out, table)
         total = ", ".join(
             counted(number, noun)
             for number, noun in (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -67,7 +68,8 @@ def list_all(given: argparse.Namespace) -> int:
     from rich.table import Table
 
     from data_catalog import list_sequences
-    from flows.terminal import console
+    from extrags.errors import did_you_mean
+    from flows.terminal import console, print_table
 
     sequences = [
         item
@@ -75,6 +77,17 @@ def list_all(given: argparse.Namespace) -> int:
         if (not given.here or item.available)
         and (fnmatchcase(item.name, given.pattern) or item.name.startswith(given.pattern))
     ]
+    if not sequences:
+        # Of families without end only the first few are in the list.
+        named = _known(given.pattern)
+        sequences = [named] if named is not None and (named.available or not given.here) else []
+    if not sequences:
+        near = did_you_mean(given.pattern, (item.name for item in list_sequences()))
+        print(
+            f"extrags: nothing in the list matches {given.pattern}{near or ';'} of phantoms and caverns the "
+            "first few are listed, @sparse and @distanced, and others are given by their whole name",
+            file=sys.stderr,
+        )
     if given.json != "-":
         table = Table(box=None, pad_edge=False, header_style="bold")
         for column in ("name", "frames", "size", "depth", "poses", "here", "description"):
@@ -90,7 +103,7 @@ def list_all(given: argparse.Namespace) -> int:
                 escape(item.description),
             )
         out = console()
-        out.print(table)
+        print_table(out, table)
         here = sum(item.available for item in sequences)
         out.print(f"{counted(len(sequences), 'sequence')}, {here} of them can be read here")
     write_json([item.model_dump(mode="json") for item in sequences], given.json)

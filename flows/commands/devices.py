@@ -37,13 +37,13 @@ def devices(given: argparse.Namespace) -> int:
         from rich.markup import escape
         from rich.table import Table
 
-        from flows.terminal import console
+        from flows.terminal import console, print_table
 
         table = Table(box=None, pad_edge=False, header_style="bold")
         for name in ("stage", "work", "device", "rasteriser", "why"):
             table.add_column(name)
         for item in found:
             table.add_row(item.stage, item.work, item.device, item.rasteriser or "-", escape(item.reason))
-        console().print(table)
+        print_table(console(), table)
     write_json([item.to_json() for item in found], given.json)
     return 0

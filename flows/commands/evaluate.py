@@ -53,10 +53,10 @@ def add_arguments(parser: Parser) -> None:
 def evaluate(given: argparse.Namespace) -> int:
     """`extrags evaluate`."""
     set_up_logging(debug=given.debug, terminal=True, quiet=given.quiet)
-    if given.renders is None and (given.depth is not None or given.depth_step is not None):
-        raise ConfigError("--depth goes with --renders: it holds the depth of the same frames")
     if given.depth is None and given.depth_step is not None:
         raise ConfigError("--depth-step goes with --depth: without it there is no depth to measure")
+    if given.renders is None and given.depth is not None:
+        raise ConfigError("--depth goes with --renders: it holds the depth of the same frames")
     found = _finished(given) if given.renders is None else _renders(given)
     if given.json != "-":
         _print(found)
@@ -141,7 +141,7 @@ def _print(found: dict[str, Any]) -> None:
     from rich.table import Table
 
     from flows.tables import figure, table_figures
-    from flows.terminal import console
+    from flows.terminal import console, print_table
 
     out = console()
     table = Table(box=None, pad_edge=False, header_style="bold")
@@ -153,7 +153,7 @@ def _print(found: dict[str, Any]) -> None:
     for group in GROUPS:
         tree = metrics[group] if group else metrics
         table.add_row(group or "valid", *(figure(name, tree.get(name)) for name in columns))
-    out.print(table)
+    print_table(out, table)
     surface = {name: value for name, value in metrics["surface"].items() if isinstance(value, float)}
     if surface:
         out.print("surface: " + ", ".join(f"{name} {value:.3f}" for name, value in surface.items()))

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from extrags.config.settings import Setting
 
 __all__ = [
+    "DEFAULT_METHOD",
     "Parser",
     "add_json",
     "add_method",
@@ -42,6 +43,7 @@ __all__ = [
 
 DEFAULT_PROFILE = "balanced"
 """That of `extrags.config`, which takes long to load."""
+DEFAULT_METHOD = "extrags"
 
 SHORT_NAMES = {"--scale": "ingest.scale_mm_per_unit"}
 """Settings with a flag of their own beside that of their name."""
@@ -158,11 +160,23 @@ def add_output(parser: Parser, metavar: str, kind: Callable[[str], str], **more:
     parser._option_string_actions["--out"] = made
 
 
+def _named_place(text: str) -> str:
+    """What `--store` names; an empty name, as of a variable that is not set, is not the default store.
+
+    Raises:
+        ArgumentTypeError: for an empty name.
+    """
+    if not text.strip():
+        raise argparse.ArgumentTypeError("expected a folder or a URL")
+    return text
+
+
 def add_store(parser: Parser) -> None:
     """`--store`."""
     parser.add_argument(
         "--store",
         metavar="DIR|URL",
+        type=_named_place,
         help="where artefacts are kept (default: $EXTRAGS_STORE, else .extrags)",
     )
 
@@ -271,7 +285,7 @@ def add_method(parser: Parser) -> None:
     parser.add_argument(
         "--method",
         choices=tuple(METHODS),
-        default="extrags",
+        default=DEFAULT_METHOD,
         help="the whole pipeline (default), the coarse scene alone, plain 3DGS, ...",
     )
     add_store(parser)

@@ -28,6 +28,7 @@ from flows.commands.common import (
     write_json,
 )
 from flows.commands.options import (
+    DEFAULT_METHOD,
     Parser,
     add_json,
     add_method,
@@ -118,6 +119,10 @@ def run(given: argparse.Namespace) -> int:
         raise ConfigError(
             "the following arguments are required: SEQUENCE or --manifest FILE (see extrags run --help)"
         )
+    if given.seeds and given.seed is not None:
+        raise ConfigError("--seeds stands in place of --seed: give one of the two")
+    if given.methods and given.method != DEFAULT_METHOD:
+        raise ConfigError("--methods stands in place of --method: give one of the two")
     begun = time.monotonic()
     outcome = execute(
         sequences,

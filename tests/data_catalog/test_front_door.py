@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -102,6 +103,34 @@ SURVEY = FolderReader(
     files=lambda folder: sorted(folder.iterdir()),
     frames=survey_frames,
 )
+
+
+class TestFilesOfASequence:
+    @pytest.mark.parametrize("file", ["poses.json", "rgb/0.png", "rgb/own/0.PNG"])
+    def test_the_folder_is_named(self, file: str, tmp_path: Path) -> None:
+        (tmp_path / "rgb" / "own").mkdir(parents=True)
+        (tmp_path / "poses.json").write_text("{}")
+        (tmp_path / file).touch()
+        with pytest.raises(SourceError, match=f"give the folder {re.escape(str(tmp_path))}$"):
+            data_catalog.resolve(tmp_path / file)
+
+    def test_not_that_of_a_model_without_its_pictures(self, tmp_path: Path) -> None:
+        model = tmp_path / "sparse" / "0"
+        model.mkdir(parents=True)
+        (tmp_path / "images").mkdir()
+        for name in ("cameras", "images", "points3D"):
+            (model / f"{name}.txt").touch()
+        with pytest.raises(SourceError, match=f"give the folder {re.escape(str(tmp_path))}$"):
+            data_catalog.resolve(model / "cameras.txt")
+
+    def test_of_frames_without_poses_too(self, tmp_path: Path) -> None:
+        Image.new("RGB", (8, 8)).save(tmp_path / "0.png")
+        with pytest.raises(SourceError, match=f"give the folder {re.escape(str(tmp_path))}$"):
+            data_catalog.resolve(tmp_path / "0.png")
+        # Not of whatever else lies beside them.
+        (tmp_path / "scene.spz").touch()
+        with pytest.raises(SourceError, match=r"\(.dcm, .dicom\)$"):
+            data_catalog.resolve(tmp_path / "scene.spz")
 
 
 class TestRegistered:

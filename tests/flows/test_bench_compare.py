@@ -63,3 +63,8 @@ def test_what_is_not_alike_is_said(tmp_path: Path, capsys: pytest.CaptureFixture
 def test_a_regression_comes_first(tmp_path: Path) -> None:
     losing = result(*(20.0 + seed / 100 for seed in range(5)))
     assert compared(tmp_path, result(*(30.0 + seed for seed in range(5))), losing) == 1
+
+
+def test_a_file_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", "compare", *[str(tmp_path / "none.json")] * 2]) == 2
+    assert capsys.readouterr().err.endswith("none.json cannot be read: No such file or directory\n")

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.console import Console
 
 from extrags.errors import StoreError
 from extrags.store import Store
@@ -313,6 +314,24 @@ class TestCache:
         said = capsys.readouterr().out
         assert "toy-v1-2" in said
         assert "3 artefacts, 5.9 KiB" in said
+
+    def test_ls_and_usage_show_whole_names_in_a_narrow_terminal(
+        self, store: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr("flows.terminal.console", lambda **_: Console(width=30))
+        assert main(["cache", "ls", "--store", store]) == 0
+        assert main(["cache", "usage", "--store", store]) == 0
+        said = capsys.readouterr().out
+        assert "toy: sequence phantom/2, made 20" in said
+        assert "size 2.0 KiB, key toy-v1-2\n" in said
+        assert "phantom/2: artefacts 1, files 2, size 2.0 KiB, last made 20" in said
+
+    def test_ls_reads_nothing_and_shows_no_progress_of_it(
+        self, store: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
+        assert main(["cache", "ls", "--store", store]) == 0
+        assert "reading" not in capsys.readouterr().err
 
     def test_ls_as_json(self, store: str, capsys: pytest.CaptureFixture[str]) -> None:
         assert main(["cache", "ls", "phantom/1", "--store", store, "--json", "-"]) == 0

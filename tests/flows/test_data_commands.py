@@ -74,6 +74,17 @@ class TestList:
         assert undocumented_items(listed, "a-catalogue-entry") == []
         assert {item["name"] for item in listed} >= {"sinus/hopkins", "simcol3d/s1"}
 
+    def test_what_is_given_by_name_alone(self, capsys: pytest.CaptureFixture[str]) -> None:
+        assert main(["data", "list", "phantom/77@covered", "--json", "-"]) == 0
+        assert [item["name"] for item in json.loads(capsys.readouterr().out)] == ["phantom/77@covered"]
+
+    def test_nothing_that_matches(self, capsys: pytest.CaptureFixture[str]) -> None:
+        assert main(["data", "list", "phantom/*@covered", "--json", "-"]) == 0
+        said = capsys.readouterr()
+        assert json.loads(said.out) == []
+        assert "nothing in the list matches phantom/*@covered; did you mean" in said.err
+        assert "others are given by their whole name" in said.err
+
 
 class TestShow:
     def test_measured_and_pictured(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -138,6 +138,7 @@ class TestEvaluate:
             (["--renders", str(tmp_path / "none")], 1, "no such folder"),
             (["--depth", str(folders / "depth")], 2, "--depth goes with --renders"),
             (["--renders", str(folders / "renders"), "--depth-step", "0.1"], 2, "--depth-step goes with"),
+            (["--depth-step", "0.1"], 2, "--depth-step goes with --depth"),
             (["--seed", "77"], 1, "run it first"),
             (["--method", "3dgs"], 2, "3dgs sets coarse.sh_degree itself"),
         ):

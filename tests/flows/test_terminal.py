@@ -1,4 +1,4 @@
-"""Names in files of others do not steer the terminal, in a table, an error or the log."""
+"""Tables in terminals of any width; names in files of others, which do not steer the terminal."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from argparse import Namespace
 from types import SimpleNamespace
 
 import pytest
+from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
@@ -15,7 +16,7 @@ from rich.text import Text
 from flows.cli import main
 from flows.commands.common import showing
 from flows.printable import PrintableFormatter, printable
-from flows.terminal import console
+from flows.terminal import console, print_table
 
 EVIL = "a\x1b]0;title\x07\x1b[2J\x9b1A\r\u202eb"
 SHOWN = r"a\x1b]0;title\x07\x1b[2J\x9b1A\r\u202eb"
@@ -76,3 +77,37 @@ def test_a_terminal_that_cannot_draw_gets_lines_of_progress(
     monkeypatch.setattr("sys.stderr", SimpleNamespace(isatty=lambda: terminal))
     monkeypatch.setenv("TERM", kind)
     assert showing(Namespace(quiet=False)) == shown
+
+
+def narrow_table() -> Table:
+    made = Table(box=None, pad_edge=False)
+    made.add_column("sequence", no_wrap=True)
+    made.add_column("size")
+    made.add_column("here")
+    made.add_column("description", overflow="fold")
+    made.add_row("c3vdv2/c1_cecum_t1@sparse", "1350x1080", "[green]yes[/]", "registered videos")
+    made.add_row("phantom/0@sparse", "", "no", "")
+    return made
+
+
+def printed(width: int) -> str:
+    out = Console(width=width)
+    with out.capture() as captured:
+        print_table(out, narrow_table())
+    return captured.get()
+
+
+@pytest.mark.parametrize("width", [20, 40, 60, 120])
+def test_no_word_is_shortened_or_left_out(width: int) -> None:
+    said = printed(width)
+    assert "…" not in said
+    words = ("c3vdv2/c1_cecum_t1@sparse", "1350x1080", "yes", "registered", "phantom/0@sparse")
+    assert all(word in said for word in words)
+
+
+def test_rows_are_lines_where_the_terminal_is_too_narrow() -> None:
+    assert printed(40).splitlines() == [
+        "c3vdv2/c1_cecum_t1@sparse: size 1350x1080, here yes, description registered videos",
+        "phantom/0@sparse: here no",
+    ]
+    assert printed(120).startswith("sequence ")

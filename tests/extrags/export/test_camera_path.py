@@ -97,7 +97,9 @@ class TestRefused:
             ({"camera_type": None}, "field camera_type"),
             ({"camera_path": []}, "0 cameras"),
             ({"camera_path": {}}, "no list"),
-            ({"camera_path": [{"fov": 50}]}, "frame 0, field camera_path"),
+            ({"camera_path": [{"fov": 50}]}, "frame 0, field camera_to_world: the field is missing"),
+            ({"camera_path": [{"camera_to_world": 16 * [1]}]}, "frame 0, field fov: the field is missing"),
+            ({"camera_path": [3]}, "frame 0, field camera_path"),
             ({"camera_path": [{"camera_to_world": [1.0] * 16, "fov": 50}]}, "frame 0"),
             ({"camera_path": [{"camera_to_world": np.eye(4).tolist(), "fov": 0}]}, "frame 0"),
             ({"fps": 0}, "0 frames per second"),
@@ -138,6 +140,11 @@ class TestRefused:
         (tmp_path / "a.json").write_text(text)
         with pytest.raises(SourceError, match="no camera path"):
             read_camera_path(tmp_path / "a.json")
+
+    def test_another_json_lacks_a_field(self, tmp_path: Path) -> None:
+        (tmp_path / "results.json").write_text('{"seconds": 3, "sequences": []}')
+        with pytest.raises(SourceError, match="field render_width: no camera path: the field is missing"):
+            read_camera_path(tmp_path / "results.json")
 
     def test_no_file(self, tmp_path: Path) -> None:
         with pytest.raises(SourceNotFoundError):
