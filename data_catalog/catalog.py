@@ -24,6 +24,7 @@ from data_catalog.folders import FolderDataset, find_reader
 from data_catalog.footage import DICOM_SUFFIXES, VIDEO_SUFFIXES
 from data_catalog.phantom.dataset import PHANTOM
 from data_catalog.pose_conventions import OPENCV
+from data_catalog.rendered_dataset import RenderedDataset
 from data_catalog.specular import with_specular
 from data_catalog.stereo import check_one_camera
 from extrags.arguments import check_settings_argument
@@ -37,6 +38,7 @@ from extrags.user_paths import expanded
 __all__ = [
     "DATASETS",
     "describe",
+    "drawn_formats",
     "glance",
     "list_sequences",
     "measured_detail",
@@ -104,6 +106,11 @@ def resolve(name_or_path: str | Path) -> Source:
             if found is not None:
                 return found
         raise _unknown(text)
+
+
+def drawn_formats() -> frozenset[str]:
+    """Formats of sequences whose frames are drawn when they are asked for (`Source.format`)."""
+    return frozenset(dataset.name for dataset in DATASETS if isinstance(dataset, RenderedDataset))
 
 
 def glance(name_or_path: str | Path, config: IngestConfig | None = None) -> Glance | None:

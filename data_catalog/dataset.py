@@ -50,6 +50,11 @@ class Descriptor(BaseModel):
     available: bool = True
     """Whether it can be read on this machine now."""
 
+    @property
+    def drawn(self) -> bool:
+        """Whether its frames are drawn when they are asked for: no files are needed."""
+        return self.folder is None
+
 
 class Source(BaseModel):
     """A sequence that can be read: found by one dataset, which alone knows what its name stands for."""

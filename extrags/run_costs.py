@@ -128,6 +128,7 @@ class Workload:
         stacks: renders of the held-out frames that are measured together.
         coarse_gaussians: of the coarse scene, where there is one; None: as many as are expected.
         final_gaussians: of the final scene, likewise.
+        drawn: whether the frames are drawn by a procedural scene, instead of read.
     """
 
     pixels: float | int
@@ -140,12 +141,15 @@ class Workload:
     stacks: int = 3
     coarse_gaussians: float | int | None = None
     final_gaussians: float | int | None = None
+    drawn: bool = False
 
     @property
     def size(self) -> dict[str, float]:
-        """What the sequence tells: pixels, frames, those for training and held out, width."""
+        """What the sequence tells: pixels, frames, those for training and held out, width, `drawn` if so."""
         found = {name: float(getattr(self, name)) for name in ("pixels", "frames", "train", "test")}
-        return found if self.width is None else {**found, "width": float(self.width)}
+        if self.width is not None:
+            found["width"] = float(self.width)
+        return {**found, "drawn": True} if self.drawn else found
 
     def numbers(self) -> dict[str, float]:
         """By name in terms."""
@@ -162,6 +166,7 @@ class Workload:
             # Of a virtual view.
             "restored": float(self.pixels) * self._restored_share(),
             "frames": float(self.frames),
+            "drawn": float(self.drawn),
             "train": float(self.train),
             "test": float(self.test),
             "iterations": float(config.coarse.iterations),

@@ -6,6 +6,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
+from data_catalog.catalog import drawn_formats
 from extrags.config import PipelineConfig
 from extrags.errors import StoreError
 from extrags.run_costs import (
@@ -230,7 +231,8 @@ def planned_work(
     skipped = {row.stage for row in outcome.stages if row.state == "skipped"}
     # Its row says that it ran: the scene was read, and nothing was trained.
     skipped |= set() if config.imported.scene is None else {"coarse"}
-    counts = store.manifest(outcome.refs["ingest"]).counts
+    source = store.manifest(outcome.refs["ingest"])
+    counts = source.counts
     coarse = store.manifest(outcome.refs["coarse"]).counts if "coarse" in outcome.refs else None
     # Rows tell of the stages that have run, the rules of those to come.
     possible = {*frames_stages(counts, config), *(row.stage for row in outcome.stages)}
@@ -246,7 +248,8 @@ def planned_work(
         config = decided.applied_to(config)
         skipped |= {line.stage for line in decided.decisions if not line.run}
     wanted = possible - skipped
-    return frames_work(counts, config, coarse), {stage for stage in STAGES if stage in wanted}
+    work = frames_work(counts, config, coarse, drawn=_is_drawn(source))
+    return work, {stage for stage in STAGES if stage in wanted}
 
 
 def unplanned_work(
@@ -383,7 +386,14 @@ def _workload(
         int(stacks) if stacks else 1,
         float(coarse) if coarse else None,
         float(final) if final else None,
+        drawn=_is_drawn(source),
     )
+
+
+def _is_drawn(source: Manifest) -> bool:
+    """Whether the frames of an artefact of `ingest` were drawn, not read."""
+    fingerprint = source.config.get("fingerprint")
+    return isinstance(fingerprint, dict) and fingerprint.get("format") in drawn_formats()
 
 
 def _ancestors(manifest: Manifest, manifests: Mapping[str, Manifest]) -> list[Manifest]:

@@ -55,7 +55,11 @@ def usual_work(config: PipelineConfig) -> Workload:
 
 
 def frames_work(
-    counts: Mapping[str, Any], config: PipelineConfig, coarse: Mapping[str, Any] | None = None
+    counts: Mapping[str, Any],
+    config: PipelineConfig,
+    coarse: Mapping[str, Any] | None = None,
+    *,
+    drawn: bool = False,
 ) -> Workload:
     """That of a sequence that has been read.
 
@@ -63,12 +67,14 @@ def frames_work(
         counts: of the artefact of its `ingest`.
         config: settings of all stages.
         coarse: counts of that of its coarse scene, where there is one.
+        drawn: whether its frames were drawn by a procedural scene.
     """
     gaussians = None if coarse is None else coarse.get("n_gaussians")
     width, height, frames, train, test = (
         float(counts[name] or 0) for name in ("width", "height", "frames", "train", "test")
     )
-    return Workload(width * height, frames, train, test, config, width=width, coarse_gaussians=gaussians)
+    size = width * height, frames, train, test
+    return Workload(*size, config, width=width, coarse_gaussians=gaussians, drawn=drawn)
 
 
 def frames_stages(
@@ -155,7 +161,8 @@ def work_before_reading(
 def _catalogue_work(about: Descriptor, config: PipelineConfig) -> Workload:
     width, height = read_size(about, config)
     frames = float(min(about.frames, config.ingest.max_frames or about.frames))
-    return Workload(float(width * height), frames, frames / 2, frames / 2, config, width=width)
+    held_out = frames / 2
+    return Workload(width * height, frames, held_out, held_out, config, width=width, drawn=about.drawn)
 
 
 def read_size(about: Descriptor, config: PipelineConfig) -> tuple[float, float]:

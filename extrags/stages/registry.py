@@ -24,7 +24,11 @@ REGISTRY: tuple[Stage, ...] = (
         indispensable=True,
         page_parts=("sequence",),
         other_parts=("ingest",),
-        tasks=(StageTask(name="ingest", cost=Cost(terms=("one", "frames", "frames*pixels"))),),
+        tasks=(
+            StageTask(
+                name="ingest", cost=Cost(terms=("one", "frames", "frames*pixels", "drawn*frames*pixels"))
+            ),
+        ),
     ),
     Stage(
         name="poses",

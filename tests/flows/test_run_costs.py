@@ -54,6 +54,8 @@ def test_records_have_the_numbers_that_costs_depend_on(filled: Store) -> None:
     assert (numbers["pixels"], numbers["frames"], numbers["iterations"]) == (48 * 40, 24, 120)
     assert cost.seconds > 0
     assert cost.peak_mib
+    # SEQUENCE is a phantom, in every record that rests on its frames.
+    assert all(work.drawn for work, _ in processor)
     # The waves are part of the exploration.
     parts = filled.ls("explore*")
     (explore,) = [cost for _, cost in elapsed if cost.task == "explore"]

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
 
 from data_catalog import describe
-from extrags.config import IngestConfig, PipelineConfig
+from extrags.config import IngestConfig, PipelineConfig, profile_config
 from extrags.run_costs import Workload, packaged_model, stage_seconds
 from flows.commands.plan import print_detail
 from flows.run_costs import RunPrediction, StageCost
-from flows.workloads import at_detail_size, detail_flags, read_size
+from flows.workloads import at_detail_size, detail_flags, expected_work, read_size
 
 
 def test_frames_of_the_size_that_keeps_their_detail_cost_less() -> None:
@@ -28,6 +29,21 @@ def test_frames_of_the_size_that_keeps_their_detail_cost_less() -> None:
 def test_frames_that_hold_all_their_detail_are_the_same_work() -> None:
     whole = Workload(675 * 540, 40, 20, 20, PipelineConfig(), width=675)
     assert at_detail_size(whole, {"detail_width": 675, "detail_height": 540}) is None
+
+
+def test_frames_that_are_drawn_take_longer_than_frames_that_are_read() -> None:
+    drawn = expected_work("phantom/0@sparse", profile_config("quick"))
+    read = expected_work("simcol3d/s1", profile_config("quick"))
+    assert drawn is not None
+    assert read is not None
+    assert (drawn.drawn, read.drawn) == (True, False)
+    assert drawn.size["drawn"]
+    assert Workload(config=drawn.config, **drawn.size) == drawn
+    # A run on record says how large its sequence was without a word on this.
+    assert "drawn" not in read.size
+    model = packaged_model()
+    as_files = model.predict("ingest", replace(drawn, drawn=False)).seconds
+    assert model.predict("ingest", drawn).seconds > 1.5 * as_files
 
 
 @pytest.mark.parametrize(
