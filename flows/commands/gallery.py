@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from extrags import __version__
-from extrags.errors import ConfigError, StoreError
+from extrags.errors import ConfigError, StoreError, reason_of
 from extrags.source_commit import source_commit
 from flows.commands.common import existing_store, items, run_options, set_up_logging, without_folders
 from flows.commands.options import Parser, add_output, add_store
@@ -93,7 +93,8 @@ def gallery(given: argparse.Namespace) -> int:
             made=_made(),
         )
     except OSError as error:
-        raise StoreError(f"the gallery cannot be written: {error}") from error
+        file = error.filename or given.output
+        raise StoreError(f"the gallery cannot be written: {file}: {reason_of(error)}") from error
     print(page)
     return 0
 
