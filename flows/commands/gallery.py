@@ -74,12 +74,13 @@ def gallery(given: argparse.Namespace) -> int:
     set_up_logging(debug=given.debug, terminal=True, quiet=given.quiet)
     store = existing_store(given)
     prepare(store.state, debug=given.debug, looks=True)
-    from flows.recorded_runs import gallery_run, last_runs
+    from flows.recorded_runs import gallery_run, last_runs, nearest_on_record
 
     chosen = last_runs(store, given.patterns, methods=items(given.methods), profiles=items(given.profiles))
     if not chosen:
         wanted = f" of {', '.join(given.patterns)}" if given.patterns else ""
-        raise StoreError(f"no finished run{wanted} is on record in {store.root}")
+        near = nearest_on_record(store, given.patterns)
+        raise StoreError(f"no finished run{wanted} is on record in {store.root}{near}")
     from extrags.report.gallery import build_gallery
 
     runs = [gallery_run(store, run) for run in chosen]
