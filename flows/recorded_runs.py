@@ -167,9 +167,9 @@ def chosen_runs(
         then = f"{meant} A" if meant else "; a"
         raise ConfigError(
             f"{', '.join(names)}: {len(runs)} finished run{'s' * (len(runs) != 1)} on record in "
-            f"{store.root}{more}{then} comparison takes two. Of runs that differ in settings alone the last one "
-            "is on record; to compare them, run once with each value in a matrix (extrags run ... --matrix "
-            "coarse.iterations=150,300), or name the pages of two runs"
+            f"{store.root}{more}{then} comparison takes two. Of runs that differ in settings alone the last "
+            "one is on record; to compare them, run once with each value in a matrix (extrags run ... "
+            "--matrix coarse.iterations=150,300), or name the pages of two runs"
         )
     return runs
 
