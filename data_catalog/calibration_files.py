@@ -34,7 +34,7 @@ from data_catalog.lens_entries import SIZE_NAMES, check_without_mirror, lens_kin
 from data_catalog.posed_frames import SourceFrames
 from data_catalog.sampling import CameraModel, LensSampling, Sampling
 from extrags.config import IngestConfig
-from extrags.errors import ConfigError, SourceError, SourceNotFoundError
+from extrags.errors import ConfigError, SourceError, SourceNotFoundError, reason_of
 from extrags.lens import Lens
 from extrags.provenance import StereoCamera
 from extrags.yaml_text import read_yaml
@@ -123,7 +123,9 @@ def _text(file: Path) -> str:
         # Editors on Windows put a mark at the beginning.
         text = file.read_text(encoding="utf-8-sig")
     except (UnicodeDecodeError, OSError) as error:
-        raise SourceError(f"cannot be read as text: {error}", file=file, field="calibration") from error
+        raise SourceError(
+            f"cannot be read as text: {reason_of(error)}", file=file, field="calibration"
+        ) from error
     return text
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from data_catalog.inside import inside
 from extrags.array_files import load_npy
-from extrags.errors import SourceError, SourceNotFoundError
+from extrags.errors import SourceError, SourceNotFoundError, reason_of
 from extrags.events import Progress, emit
 from extrags.frame_names import COLOR_SUFFIXES, NameOrder
 from extrags.sequence import EndoscopicSequence
@@ -269,7 +269,9 @@ def read_depth(file: Path, *, frame: object = None) -> Float[np.ndarray, "h w"]:
         try:
             values = load_npy(file)
         except (ValueError, OSError) as error:
-            raise SourceError(f"cannot be read: {error}", file=file, frame=frame, field="depth") from error
+            raise SourceError(
+                f"cannot be read: {reason_of(error)}", file=file, frame=frame, field="depth"
+            ) from error
     else:
         values = np.array(_stored_numbers(file, frame))
     if values.ndim != 2 or values.dtype.kind not in "fiu":
@@ -428,7 +430,7 @@ def _image_errors(file: Path, frame: object, field: str) -> Iterator[None]:
     ) as error:
         # Pillow reports damage inside an image as any of these.
         raise SourceError(
-            f"damaged or truncated image ({file.stat().st_size} bytes): {error}",
+            f"damaged or truncated image ({file.stat().st_size} bytes): {reason_of(error)}",
             file=file,
             frame=frame,
             field=field,

@@ -1,11 +1,16 @@
 """The public names of `import extrags`; this module is imported when the first of them is used.
 
+Its functions are those of the modules they come from, and check what kinds of arguments they are given.
+
 Reading belongs to `data_catalog`, a layer above the library: no other module of the library imports it.
 """
 
 from __future__ import annotations
 
+from inspect import isclass, isfunction
+
 from data_catalog import read, register_reader
+from extrags.arguments import with_checked_arguments
 from extrags.assessment import assess
 from extrags.cameras import Cameras
 from extrags.config import (
@@ -114,3 +119,12 @@ __all__ = [
     "with_estimated_depth",
     "with_estimated_poses",
 ]
+
+_classes = {name: value for name, value in globals().items() if isclass(value)}
+globals().update(
+    {
+        name: with_checked_arguments(value, _classes)
+        for name, value in list(globals().items())
+        if name in __all__ and isfunction(value)
+    }
+)

@@ -29,6 +29,7 @@ __all__ = [
     "WeightsError",
     "did_you_mean",
     "installed_with",
+    "reason_of",
 ]
 
 
@@ -55,6 +56,15 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     ending = f".{name.lstrip('-')}"
     near = [other for other in known if other.endswith(ending)] or get_close_matches(name, known, n=1)
     return f"; did you mean {' or '.join(near)}?" if near else ""
+
+
+def reason_of(error: BaseException) -> str:
+    """What an error says, to be appended to a message that names the file.
+
+    Args:
+        error: of the operating system: without its number and file; any other: as it is.
+    """
+    return getattr(error, "strerror", None) or str(error)
 
 
 class ExtragsError(Exception):

@@ -13,7 +13,14 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from extrags.array_files import load_ply_vertices
-from extrags.errors import CaptureError, NonFiniteError, ShapeError, SourceError, SourceNotFoundError
+from extrags.errors import (
+    CaptureError,
+    NonFiniteError,
+    ShapeError,
+    SourceError,
+    SourceNotFoundError,
+    reason_of,
+)
 from extrags.output_files import whole_file
 from extrags.zarr_io import new_group, open_group, read_array, write_array
 
@@ -247,7 +254,9 @@ class Gaussians:
             raise SourceNotFoundError("no such file", file=path)
         try:
             vertex = load_ply_vertices(Path(path))
-        except (OSError, ValueError) as error:
+        except OSError as error:
+            raise SourceError(f"cannot be read: {reason_of(error)}", file=path) from error
+        except ValueError as error:
             raise SourceError(f"not a 3DGS PLY: {error}", file=path) from error
         names = set(vertex.dtype.names or ())
         if PACKED_PROPERTY in names:

@@ -12,6 +12,7 @@ from jaxtyping import Float, Int8
 from torch import Tensor
 from torch.nn import functional
 
+from extrags.arguments import check_argument
 from extrags.cameras import Cameras
 from extrags.errors import ShapeError
 from extrags.gaussians import Gaussians
@@ -104,7 +105,11 @@ class Scene(Storable):
 
         Returns:
             Renderings of all cameras in one batch.
+
+        Raises:
+            TypeError: when `cameras` are none, such as a sequence.
         """
+        check_argument(cameras, Cameras, "Scene.render", "cameras")
         degree = self.gaussians.sh_degree
         return self._rasterized(
             cameras,

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TypeVar
 
-from extrags.errors import StoreError
+from extrags.errors import StoreError, reason_of
 from extrags.store import Store
 from extrags.store.retention import Cleaning, Policy, apply_policy, planned_removals
 from extrags.store.runs import sweep_unreadable
@@ -49,7 +49,7 @@ class Cleaned:
         except StoreError as error:
             self.problems.append(error)
         except OSError as error:
-            problem = StoreError(f"{error.filename or 'a file'}: {error.strerror or error}")
+            problem = StoreError(f"{error.filename or 'a file'}: {reason_of(error)}")
             problem.__cause__ = error
             self.problems.append(problem)
         return None

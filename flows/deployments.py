@@ -8,7 +8,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from extrags.errors import ConfigError
+from extrags.errors import ConfigError, reason_of
 from extrags.yaml_text import read_yaml
 
 __all__ = ["FILE", "Declared", "chosen_deployments", "declared_deployments", "usual_file"]
@@ -116,7 +116,7 @@ def declared_deployments(file: Path) -> list[Declared]:
     try:
         content = read_yaml(file.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise ConfigError(f"{file} cannot be read: {error}") from error
+        raise ConfigError(f"{file} cannot be read: {reason_of(error)}") from error
     entries = content.get("deployments") if isinstance(content, dict) else None
     if not isinstance(entries, list) or not entries:
         raise ConfigError(f"{file} declares no deployments")

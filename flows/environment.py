@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from extrags.data_directories import check_home
-from extrags.errors import StoreError
+from extrags.errors import StoreError, reason_of
 from tasks.page_choice import PAGE_VARIABLE, page_chosen
 
 __all__ = ["has_own_home", "prepare", "without_heartbeat"]
@@ -58,7 +58,7 @@ def prepare(state: Path, *, debug: bool = False, looks: bool = False) -> None:
             home.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             if not looks:
-                raise StoreError(f"the store {state} cannot be written: {error.strerror or error}") from error
+                raise StoreError(f"the store {state} cannot be written: {reason_of(error)}") from error
             # Prefect would say so at its import.
             warnings.filterwarnings("ignore", message="Failed to create the Prefect home directory")
         # Nobody looks at the page of a run on a server that goes with it.

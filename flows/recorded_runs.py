@@ -12,7 +12,7 @@ from urllib.parse import quote
 
 from data_catalog.names import comparable_name, path_of
 from data_catalog.patterns import is_named
-from extrags.errors import ConfigError, StoreError, UnknownSequenceError
+from extrags.errors import ConfigError, StoreError, UnknownSequenceError, did_you_mean
 from extrags.pipeline import HELD_OUT_TRAINED_ON
 from extrags.report.leaderboard import BoardRow
 from extrags.store import Manifest, Ref, Store
@@ -163,13 +163,24 @@ def chosen_runs(
         )
     if len(runs) < 2:
         more = f", and {unfinished} that did not come to a page" if unfinished else ""
+        meant = nearest_on_record(store, names)
+        then = f"{meant} A" if meant else "; a"
         raise ConfigError(
             f"{', '.join(names)}: {len(runs)} finished run{'s' * (len(runs) != 1)} on record in "
-            f"{store.root}{more}; a comparison takes two. Of runs that differ in settings alone the last one "
-            "is on record; to compare them, run once with each value in a matrix (extrags run ... --matrix "
-            "coarse.iterations=150,300), or name the pages of two runs"
+            f"{store.root}{more}{then} comparison takes two. Of runs that differ in settings alone the last "
+            "one is on record; to compare them, run once with each value in a matrix (extrags run ... "
+            "--matrix coarse.iterations=150,300), or name the pages of two runs"
         )
     return runs
+
+
+def nearest_on_record(store: Store, names: Sequence[str]) -> str:
+    """`; did you mean A?` of the first name that no run on record has; empty where there is none like it."""
+    records = list(outcome_records(store).values())
+    known = {recorded_name(record) for record in records}
+    unknown = (name for name in names if comparable_name(name) not in known)
+    hints = (did_you_mean(name, dict.fromkeys(told_apart(records))) for name in unknown)
+    return next(filter(None, hints), "")
 
 
 def run_names(runs: Sequence[RecordedRun]) -> list[str]:

@@ -15,7 +15,7 @@ from data_catalog.names import comparable_name, plain_name
 from data_catalog.patterns import is_pattern, matching_names
 from extrags.config import PipelineConfig
 from extrags.config.settings import parsed_words, settings_of
-from extrags.errors import ConfigError
+from extrags.errors import ConfigError, reason_of
 from extrags.store import digest_of
 from extrags.user_paths import expanded
 from extrags.yaml_text import read_yaml
@@ -121,7 +121,7 @@ def _manifest(file: Path) -> Iterator[Chosen]:
         # Editors of some systems begin a file with a byte-order mark.
         text = file.read_text(encoding="utf-8-sig")
     except OSError as error:
-        raise ConfigError(f"the manifest {file} cannot be read: {error.strerror or error}") from error
+        raise ConfigError(f"the manifest {file} cannot be read: {reason_of(error)}") from error
     except UnicodeDecodeError as error:
         raise ConfigError(f"the manifest {file} cannot be read: {error}") from error
     suffix = file.suffix.lower()

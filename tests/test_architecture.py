@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import subprocess
 import sys
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 
 import yaml
@@ -87,3 +89,27 @@ def test_root_holds_only_what_belongs_there() -> None:
         "pyproject.toml", "README.md", "LICENSE", "Makefile", "CMakeLists.txt", "prefect.yaml",
         "requirements.lock", "deploy",
     }  # fmt: skip
+
+
+def test_messages_hold_no_text_of_the_operating_system_as_python_puts_it() -> None:
+    """`[Errno 21] Is a directory: /tmp`: they name the file themselves; `reason_of` has the rest."""
+    files = [
+        path
+        for package in ("extrags", "data_catalog", "tasks", "flows")
+        for path in (REPOSITORY / package).rglob("*.py")
+    ]
+    assert [place for file in files for place in _bare_reasons(file)] == []
+
+
+def _bare_reasons(file: Path) -> Iterator[str]:
+    for handler in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if not isinstance(handler, ast.ExceptHandler) or "OSError" not in ast.unparse(
+            handler.type or handler
+        ):
+            continue
+        for node in ast.walk(handler):
+            if not isinstance(node, ast.Raise):
+                continue
+            for part in ast.walk(node):
+                if isinstance(part, ast.FormattedValue) and ast.unparse(part.value) == handler.name:
+                    yield f"{file}:{part.lineno}"

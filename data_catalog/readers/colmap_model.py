@@ -26,6 +26,7 @@ from __future__ import annotations
 
 import logging
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -69,6 +70,8 @@ logger = logging.getLogger(__name__)
 LENGTH_UNIT_FILE = "length_unit.txt"
 _PLACES = ("sparse", "colmap/sparse", "colmap", "dense/sparse", ".")
 _DEPTH_KINDS = ("geometric", "photometric")
+_FOLDERS_ABOVE = 3
+"""Of a model at most: colmap/sparse/0."""
 _NO_OBSERVATIONS = np.zeros((0, 2)), np.zeros(0, dtype=np.int64)
 
 
@@ -172,6 +175,27 @@ def _located(folder: Path, names: list[str], pose_file: Path) -> tuple[Path, dic
     return root, found
 
 
+def _check_images_are_not_above(folder: Path, files: Mapping[str, Path]) -> None:
+    """Refuse the folder of a model by itself, such as sparse/0, where a folder above it has the images.
+
+    Raises:
+        SourceNotFoundError: names the folder to give.
+    """
+    if any(file.is_file() for file in files.values()):
+        return
+    for above in list(folder.absolute().parents)[:_FOLDERS_ABOVE]:
+        model = model_folder(above) if os.access(above, os.R_OK | os.X_OK) else None
+        if model is None:
+            continue
+        root = _image_root(_workspace(above, model), list(files))
+        if any(_lies_in(root, name) for name in files):
+            raise SourceNotFoundError(
+                f"this is the model alone, without its {len(files)} images; give the folder {above}, which "
+                "holds them",
+                file=folder,
+            )
+
+
 def _pose_file(model: Path) -> Path:
     return next(file for file in (model / "images.bin", model / "images.txt") if file.is_file())
 
@@ -208,6 +232,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     root, located = _located(folder, [image.name for image in listed], pose_file)
     _tell_about_unposed(root, {item.name for item in located.values()})
     files = {name: item.color for name, item in located.items()}
+    _check_images_are_not_above(folder, files)
     present = present_frames(files, config.max_absent_share, listing=pose_file)
     splits = _splits(folder, listed)
     images = [image for image in listed if image.name in present and (not splits or image.name in splits)]

@@ -45,6 +45,7 @@ from extrags.errors import (
     SourceError,
     SourceNotFoundError,
     installed_with,
+    reason_of,
 )
 
 __all__ = ["READER", "DicomFile", "open_dicom"]
@@ -352,5 +353,5 @@ def _dicom_errors(file: Path, frame: int | None) -> Iterator[None]:
         struct.error,
     ) as error:
         raise SourceError(
-            f"damaged, truncated, or of an unknown compression: {error}", file=file, frame=frame
+            f"damaged, truncated, or of an unknown compression: {reason_of(error)}", file=file, frame=frame
         ) from error

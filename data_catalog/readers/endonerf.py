@@ -43,7 +43,7 @@ from data_catalog.pose_conventions import LLFF
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from extrags.array_files import load_npy
 from extrags.config import IngestConfig
-from extrags.errors import PoseError, SourceError, SourceNotFoundError
+from extrags.errors import PoseError, SourceError, SourceNotFoundError, reason_of
 from extrags.frame_names import NameOrder, order_for_fingerprint, tell_about_order
 from extrags.lens import Lens
 
@@ -191,7 +191,7 @@ def read_llff(
     try:
         rows = load_npy(file)
     except (ValueError, EOFError, OSError) as error:
-        raise SourceError(f"cannot be read: {error}", file=file, field="poses") from error
+        raise SourceError(f"cannot be read: {reason_of(error)}", file=file, field="poses") from error
     if rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind != "f":
         raise SourceError(
             f"found an array {rows.shape} of {rows.dtype}; expected [frames, 17] numbers",

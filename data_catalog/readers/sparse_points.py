@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from extrags.array_files import load_ply_vertices
-from extrags.errors import SourceError
+from extrags.errors import SourceError, reason_of
 
 __all__ = ["finite_points", "read_ply_points", "write_ply_points"]
 
@@ -64,7 +64,7 @@ def read_ply_points(
         vertices = load_ply_vertices(file)
         located = np.stack([np.asarray(vertices[axis], dtype=np.float64) for axis in "xyz"], axis=1)
     except (OSError, TypeError, ValueError) as error:
-        raise SourceError(f"no PLY with vertices: {error}", file=file, field=field) from error
+        raise SourceError(f"no PLY with vertices: {reason_of(error)}", file=file, field=field) from error
     colored = [vertices[name] for name in _COLORS if name in (vertices.dtype.names or ())]
     if len(colored) < len(_COLORS):
         return finite_points(located, None, file)

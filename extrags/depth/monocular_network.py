@@ -18,7 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from extrags.errors import MissingDependencyError, WeightsError, installed_with
+from extrags.errors import MissingDependencyError, WeightsError, installed_with, reason_of
 from extrags.model_files import fingerprint, missing_weights
 from extrags.user_paths import expanded
 
@@ -202,7 +202,9 @@ def load_monocular(setting: str, device: torch.device) -> MonocularNetwork:
             output_loading_info=True,
         )
     except (OSError, ValueError, TypeError, KeyError, RuntimeError) as error:
-        raise WeightsError(f"depth.monocular={setting}: {folder} cannot be loaded: {error}") from error
+        raise WeightsError(
+            f"depth.monocular={setting}: {folder} cannot be loaded: {reason_of(error)}"
+        ) from error
     finally:
         if shown:
             logging.enable_progress_bar()
@@ -223,7 +225,7 @@ def _json(file: Path) -> dict[str, Any]:
     try:
         found = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise WeightsError(f"{file}: not readable as JSON ({error})") from error
+        raise WeightsError(f"{file}: not readable as JSON ({reason_of(error)})") from error
     if not isinstance(found, dict):
         raise WeightsError(f"{file}: expected a JSON object")
     return found

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from extrags.cameras import Cameras
-from extrags.errors import ConfigError, ExtragsError, ShapeError, StoreError
+from extrags.errors import ConfigError, ExtragsError, ShapeError, StoreError, reason_of
 from extrags.events import Progress, emit
 from extrags.exploration.coverage import direction_counts, training_coverage
 from extrags.facing import one_sided_attributes, one_sided_rendering
@@ -200,7 +200,7 @@ def _told_of(file: Path) -> Iterator[None]:
         # It names the file already.
         raise
     except (OSError, FFmpegError, ValueError) as error:
-        raise StoreError(f"{file} cannot be written as H.264: {error}") from error
+        raise StoreError(f"{file} cannot be written as H.264: {reason_of(error)}") from error
 
 
 def _colored(share: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:

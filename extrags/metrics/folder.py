@@ -18,7 +18,14 @@ import numpy as np
 from jaxtyping import Float
 
 from extrags.array_files import load_npy
-from extrags.errors import ConfigError, NonFiniteError, ShapeError, SourceError, SourceNotFoundError
+from extrags.errors import (
+    ConfigError,
+    NonFiniteError,
+    ShapeError,
+    SourceError,
+    SourceNotFoundError,
+    reason_of,
+)
 from extrags.frame_names import NameOrder, tell_about_order
 from extrags.frame_stacks import stacked
 from extrags.metrics.protocol import RenderedViews
@@ -210,7 +217,7 @@ def _color(file: Path, shape: tuple[int, int]) -> Float[np.ndarray, "h w 3"]:
                 )
             levels = np.asarray(image.convert("RGB"))
     except (UnidentifiedImageError, OSError, SyntaxError) as error:
-        raise SourceError(f"this is no image that can be read: {error}", file=file) from error
+        raise SourceError(f"this is no image that can be read: {reason_of(error)}", file=file) from error
     _check_size(file, levels.shape[:2], shape)
     return levels.astype(np.float32) / 255
 
@@ -225,7 +232,7 @@ def _depth(file: Path, shape: tuple[int, int], step_mm: float | None) -> Float[n
             with Image.open(file) as image:
                 values = np.asarray(image)
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
-        raise SourceError(f"this is no depth map that can be read: {error}", file=file) from error
+        raise SourceError(f"this is no depth map that can be read: {reason_of(error)}", file=file) from error
     values = values[..., 0] if values.ndim == 3 and values.shape[-1] == 1 else values
     if values.ndim != 2:
         raise ShapeError(f"{file}: a depth map has shape {values.shape}, expected two dimensions")

@@ -21,7 +21,7 @@ from torch import Tensor
 from extrags.array_files import load_npz, load_state_dict
 from extrags.config import LpipsNet
 from extrags.data_directories import weights_roots
-from extrags.errors import ConfigError, WeightsError, installed_with
+from extrags.errors import ConfigError, WeightsError, installed_with, reason_of
 from extrags.metrics.lpips_networks import LAYERS, array_names, misshapen_array
 from extrags.user_paths import expanded
 
@@ -135,7 +135,7 @@ def read_weights(files: tuple[Path, ...], net: LpipsNet) -> dict[str, Tensor]:
             arrays = load_npz(files[0])
             weights = {name: torch.from_numpy(value.astype(np.float32)) for name, value in arrays.items()}
         except (OSError, TypeError, ValueError) as error:
-            raise WeightsError(f"{said}: not a readable npz file ({error})") from error
+            raise WeightsError(f"{said}: not a readable npz file ({reason_of(error)})") from error
     else:
         heads, backbone = (_state_dict(file) for file in files)
         weights = {name: tensor.float() for name, tensor in backbone.items()}
@@ -213,7 +213,7 @@ def download_backbone(net: LpipsNet) -> Path:
         file.parent.mkdir(parents=True, exist_ok=True)
         torch.hub.download_url_to_file(url, str(file), hash_prefix=_digest_prefix(file), progress=False)
     except (OSError, RuntimeError) as error:
-        raise WeightsError(f"{url} could not be downloaded to {file}: {error}") from error
+        raise WeightsError(f"{url} could not be downloaded to {file}: {reason_of(error)}") from error
     return file
 
 
@@ -244,7 +244,7 @@ def _state_dict(file: Path) -> dict[str, Tensor]:
     try:
         return load_state_dict(file)
     except (OSError, ValueError) as error:
-        raise WeightsError(f"{file}: not a readable file of PyTorch weights ({error})") from error
+        raise WeightsError(f"{file}: not a readable file of PyTorch weights ({reason_of(error)})") from error
 
 
 def _other_network(file: Path, net: LpipsNet) -> LpipsNet | None:

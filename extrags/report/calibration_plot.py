@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from extrags.errors import ConfigError
+from extrags.errors import ConfigError, reason_of
 from extrags.output_files import whole_file
 from extrags.report.charts import METHOD_COLORS, QUIET, drawing_style, svg_image
 from extrags.report.encode import DataImage
@@ -44,7 +44,7 @@ def write_calibration_plot(curves: Mapping[str, Mapping[str, Any]], path: Path) 
             with whole_file(path) as partial:
                 figure.savefig(partial, dpi=150, facecolor="white")
         except (OSError, ValueError) as error:
-            raise ConfigError(f"{path} cannot be written: {error}") from error
+            raise ConfigError(f"{path} cannot be written: {reason_of(error)}") from error
 
 
 def _drawn(curves: Mapping[str, Mapping[str, Any]]) -> Any:

@@ -9,9 +9,11 @@ import io
 import re
 import textwrap
 import threading
+import warnings
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -50,8 +52,26 @@ RULE = "#d9dee4"
 
 # matplotlib keeps its style in one global dictionary; figures of parallel tasks take turns.
 _STYLE_LOCK = threading.Lock()
+_FONT = "DejaVu Sans"
+"""Ships with matplotlib: the same everywhere."""
+_FURTHER_FONTS = (
+    "Noto Sans CJK SC",
+    "Noto Sans CJK JP",
+    "Source Han Sans SC",
+    "Source Han Sans JP",
+    "WenQuanYi Micro Hei",
+    "WenQuanYi Zen Hei",
+    "Droid Sans Fallback",
+    "IPAGothic",
+    "Microsoft YaHei",
+    "Yu Gothic",
+    "Malgun Gothic",
+    "PingFang SC",
+    "Hiragino Sans",
+    "Arial Unicode MS",
+)
+"""With the letters of Chinese, Japanese and Korean, which `_FONT` lacks; systems come with one or another."""
 _STYLE: Any = {
-    "font.family": "DejaVu Sans",  # ships with matplotlib: the same everywhere
     "font.size": 9.0,
     "text.parse_math": False,  # names of sequences may have any letters
     "axes.edgecolor": RULE,
@@ -98,15 +118,53 @@ def drawing_style() -> Iterator[None]:
     """Draw in the report's style, one figure at a time, and leave matplotlib as it was."""
     import matplotlib
 
-    with _STYLE_LOCK, matplotlib.rc_context(_STYLE):
+    with _STYLE_LOCK, matplotlib.rc_context({**_STYLE, "font.family": _families()}):
         yield
 
 
+@cache
+def _families() -> list[str]:
+    """The font of charts, and those of this machine that have letters which it lacks.
+
+    matplotlib takes each letter from the first that has it, so that other text is the same everywhere.
+    """
+    from matplotlib.font_manager import get_font_names
+
+    return [_FONT, *(name for name in _FURTHER_FONTS if name in get_font_names())]
+
+
+@cache
+def _letters() -> frozenset[int]:
+    """Code points that charts can be drawn with here."""
+    from matplotlib.font_manager import findfont, get_font
+
+    return frozenset().union(*(get_font(findfont(name)).get_charmap() for name in _families()))
+
+
+def _lacks_letters(figure: Any) -> bool:
+    from matplotlib.text import Text
+
+    texts = "".join(text.get_text() for text in figure.findobj(Text))
+    return not {ord(letter) for letter in texts if letter.isprintable()} <= _letters()
+
+
 def svg_image(figure: Any) -> Chart:
-    """A figure as an SVG data URI without date or random names; call inside `drawing_style`."""
+    """A figure as an SVG data URI without date or random names; call inside `drawing_style`.
+
+    Text is outlines. Where no font of this machine has all of its letters, such as those of Chinese, it stays
+    text, and whoever looks at the figure has it in a font of their own.
+    """
+    import matplotlib
+
     buffer = io.StringIO()
-    figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None}, transparent=True)
+    with warnings.catch_warnings():
+        as_text: Any = {"svg.fonttype": "none"} if _lacks_letters(figure) else {}
+        if as_text:
+            warnings.filterwarnings("ignore", message="Glyph .* missing from font")
+        with matplotlib.rc_context(as_text):
+            figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None}, transparent=True)
     text = _LONG_PATHS.sub(lambda path: _LONG_FRACTION.sub(r"\1", path.group()), buffer.getvalue())
+    text = text.replace(f"'{_FONT}'", f"'{_FONT}', sans-serif")
     width, height = (round(float(inches) * 72) for inches in figure.get_size_inches())
     return Chart(data_uri(text.encode("utf-8"), "image/svg+xml"), width, height)
 

@@ -33,11 +33,19 @@ class Chart(DataImage):
         return replace(self, name=name, csv=csv_uri(header, rows))
 
 
+# Names of sequences, frames and runs are others' text. The apostrophe is what OWASP recommends against it:
+# https://owasp.org/www-community/attacks/CSV_Injection
+_FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")
+
+
 def csv_text(header: Sequence[str], rows: Iterable[Sequence[Cell]]) -> str:
-    """Comma-separated values as in RFC 4180, with nine digits; empty where a number is missing."""
+    """Comma-separated values as in RFC 4180, with nine digits; empty where a number is missing.
+
+    Text that a spreadsheet would take for a formula has an apostrophe before it.
+    """
     buffer = io.StringIO()
     writer = csv.writer(buffer)
-    writer.writerow(header)
+    writer.writerow([_text(name) for name in header])
     writer.writerows([_text(cell) for cell in row] for row in rows)
     return buffer.getvalue()
 
@@ -57,4 +65,14 @@ def _text(cell: Cell) -> str:
         return ""
     if isinstance(cell, bool):
         return "yes" if cell else "no"
+    if isinstance(cell, str) and cell.startswith(_FORMULA_STARTS) and not _is_number(cell):
+        return f"'{cell}"
     return f"{cell:.9g}" if isinstance(cell, float) else str(cell)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from extrags.errors import ConfigError
+from extrags.errors import ConfigError, reason_of
 from extrags.metrics.fronts import COSTS, SCENE
 from extrags.metrics.registry import figures
 from extrags.output_files import whole_file
@@ -88,7 +88,7 @@ def write_fronts_plot(
             with whole_file(path) as partial:
                 figure.savefig(partial, dpi=150, facecolor="white", metadata=metadata)
         except (OSError, ValueError) as error:
-            raise ConfigError(f"{path} cannot be written: {error}") from error
+            raise ConfigError(f"{path} cannot be written: {reason_of(error)}") from error
 
 
 def _front(found: Sequence[Mapping[str, Any]], scene: tuple[Any, ...], cost: str, name: str) -> list[Any]:

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from extrags.errors import WeightsError
+from extrags.errors import WeightsError, reason_of
 from extrags.output_files import write_file
 
 __all__ = [
@@ -45,7 +45,7 @@ def read_description(file: Path) -> dict[str, Any]:
     try:
         return dict(json.loads(file.read_text(encoding="utf-8")))
     except (OSError, RecursionError, TypeError, ValueError) as error:
-        raise WeightsError(f"{file}: not readable as a JSON object ({error})") from error
+        raise WeightsError(f"{file}: not readable as a JSON object ({reason_of(error)})") from error
 
 
 def check_format(file: Path, description: Mapping[str, Any], expected: int) -> None:

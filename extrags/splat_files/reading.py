@@ -7,7 +7,7 @@ from typing import Literal
 
 import torch
 
-from extrags.errors import SourceError, SourceNotFoundError
+from extrags.errors import SourceError, SourceNotFoundError, reason_of
 from extrags.gaussians import COMPRESSED_PLY, PACKED_PROPERTY
 from extrags.scene import Scene
 from extrags.splat_files.ply import read_ply_scene
@@ -33,7 +33,7 @@ def splat_format(path: Path) -> Literal["ply", "spz"]:
         with path.open("rb") as stream:
             start = stream.read(_HEADER_BYTES)
     except OSError as error:
-        raise SourceError(f"cannot be read: {error.strerror or error}", file=path) from error
+        raise SourceError(f"cannot be read: {reason_of(error)}", file=path) from error
     if start[:2] == b"\x1f\x8b" or start[:4] == b"NGSP":
         return "spz"
     if start[:3] == b"ply":

@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
-from extrags.errors import SourceError, SourceNotFoundError
+from extrags.errors import SourceError, SourceNotFoundError, reason_of
 from extrags.gaussians import Gaussians
 from extrags.output_files import write_file
 from extrags.splat_files.packing import largest_component, levels, unit_quaternions
@@ -160,7 +160,7 @@ def _gzipped(path: Path) -> _Planes:
             # Not more than announced: a small file can unpack to anything.
             body = stream.read(n * sum(sizes))
     except (OSError, EOFError, zlib.error) as error:
-        raise SourceError(f"not an SPZ file, or damaged: {error}", file=path) from error
+        raise SourceError(f"not an SPZ file, or damaged: {reason_of(error)}", file=path) from error
     if len(body) < n * sum(sizes):
         raise SourceError(f"{n} Gaussians announced, but the file is truncated", file=path, field="count")
     ends = np.cumsum([n * size for size in sizes])[:-1]

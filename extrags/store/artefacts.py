@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from extrags.errors import ArtefactGoneError, ConfigError, DamagedArtefactError, StoreError
+from extrags.errors import ArtefactGoneError, ConfigError, DamagedArtefactError, StoreError, reason_of
 from extrags.redaction import has_credentials, without_credentials, without_credentials_in
 from extrags.store.artefact_names import found_by, keys_of_other_places, matches
 from extrags.store.canonical import Ref
@@ -264,7 +264,7 @@ class Store:
         except StoreError as error:
             return _as_damage(error, key, self.root)
         except OSError as error:
-            raise StoreError(f"{error.filename or key} cannot be read: {error.strerror or error}") from error
+            raise StoreError(f"{error.filename or key} cannot be read: {reason_of(error)}") from error
         return None if damage is None else self._damaged(key, damage)
 
     def verify(self, ref: Ref) -> bool:
@@ -301,7 +301,9 @@ class Store:
         try:
             place = self.backend.set_aside(damage.key, record)
         except OSError as error:
-            raise StoreError(f"{damage.key} cannot be set aside in {self.root}: {error}") from error
+            raise StoreError(
+                f"{damage.key} cannot be set aside in {self.root}: {reason_of(error)}"
+            ) from error
         if place is not None:
             log.warning(
                 "stage %s: artefact %s is damaged (%s); it is set aside as %s and made anew when needed",

@@ -14,7 +14,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from extrags.errors import DamagedArtefactError, StoreError
+from extrags.errors import DamagedArtefactError, StoreError, reason_of
 from extrags.store.canonical import Ref
 from extrags.store.integrity import Damage, Depth, find_damage, intact_manifest
 from extrags.store.manifest import MANIFEST, Manifest, manifest_text, parsed_manifest, same_content, stage_of
@@ -104,7 +104,7 @@ class DirectoryBackend:
                 store=str(self.root),
             ) from error
         except OSError as error:
-            raise StoreError(f"{path} cannot be read: {error.strerror or error}") from error
+            raise StoreError(f"{path} cannot be read: {reason_of(error)}") from error
 
     def uri(self, key: str) -> str:
         """Path of the artefact of a key."""
@@ -273,9 +273,7 @@ class DirectoryBackend:
         except FileNotFoundError:
             return None
         except OSError as error:
-            raise StoreError(
-                f"{key} cannot be removed from {self.root}: {error.strerror or error}"
-            ) from error
+            raise StoreError(f"{key} cannot be removed from {self.root}: {reason_of(error)}") from error
         return aside
 
     def sweep(self, older_than_hours: float, *, dry_run: bool = False) -> list[str]:
@@ -446,7 +444,7 @@ def remove_entries(parent: Path, *, dry_run: bool = False) -> tuple[list[str], l
     except FileNotFoundError:
         return removed, refused
     except OSError as error:
-        refused.append(StoreError(f"{parent} cannot be listed: {error.strerror or error}"))
+        refused.append(StoreError(f"{parent} cannot be listed: {reason_of(error)}"))
         return removed, refused
     for name in names:
         path = parent / name
@@ -456,7 +454,7 @@ def remove_entries(parent: Path, *, dry_run: bool = False) -> tuple[list[str], l
                 with suppress(FileNotFoundError):
                     shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
         except OSError as error:
-            problem = StoreError(f"{path} cannot be removed: {error.strerror or error}")
+            problem = StoreError(f"{path} cannot be removed: {reason_of(error)}")
             problem.__cause__ = error
             refused.append(problem)
         else:

@@ -13,7 +13,7 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from extrags.errors import StoreError
+from extrags.errors import StoreError, reason_of
 from extrags.store.artefacts import Store
 from extrags.store.directory import ABOUT, held_directories
 
@@ -43,7 +43,9 @@ def write_record(store: Store, name: str, record: Mapping[str, Any]) -> None:
     except StoreError:
         raise
     except OSError as error:
-        raise StoreError(f"the record {name} cannot be written to {store.root}: {error}") from error
+        raise StoreError(
+            f"the record {name} cannot be written to {store.root}: {reason_of(error)}"
+        ) from error
 
 
 def read_records(store: Store, prefix: str = "") -> dict[str, dict[str, Any]]:
@@ -59,7 +61,7 @@ def read_records(store: Store, prefix: str = "") -> dict[str, dict[str, Any]]:
     try:
         texts = store.backend.read_records(prefix)
     except OSError as error:
-        raise StoreError(f"the records of {store.root} cannot be read: {error}") from error
+        raise StoreError(f"the records of {store.root} cannot be read: {reason_of(error)}") from error
     found = {}
     for name, text in sorted(texts.items()):
         try:
@@ -78,7 +80,9 @@ def remove_record(store: Store, name: str) -> None:
     try:
         store.backend.remove_record(name + _SUFFIX)
     except OSError as error:
-        raise StoreError(f"the record {name} cannot be removed from {store.root}: {error}") from error
+        raise StoreError(
+            f"the record {name} cannot be removed from {store.root}: {reason_of(error)}"
+        ) from error
 
 
 def in_work(store: Store) -> list[dict[str, str]]:

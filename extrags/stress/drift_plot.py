@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from extrags.errors import ConfigError
+from extrags.errors import ConfigError, reason_of
 from extrags.output_files import whole_file
 from extrags.report.charts import METHOD_COLORS, drawing_style
 from extrags.stress.optimiser import Drift
@@ -52,4 +52,4 @@ def write_drift_plot(trainings: Mapping[str, Sequence[Drift]], path: Path) -> No
             with whole_file(path) as partial:
                 figure.savefig(partial, dpi=150, facecolor="white")
         except (OSError, ValueError) as error:
-            raise ConfigError(f"{path} cannot be written: {error}") from error
+            raise ConfigError(f"{path} cannot be written: {reason_of(error)}") from error

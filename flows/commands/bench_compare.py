@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from extrags.errors import ConfigError
+from extrags.errors import ConfigError, reason_of
 from flows.commands.common import write_json
 from flows.commands.options import Parser, add_json
 
@@ -51,7 +51,7 @@ def _read(path: Path) -> dict[str, Any]:
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise ConfigError(f"{path} cannot be read: {error.strerror or error}") from error
+        raise ConfigError(f"{path} cannot be read: {reason_of(error)}") from error
     except ValueError as error:
         raise ConfigError(f"{path} is no JSON that can be read: {error}") from error
     if not isinstance(found, dict):

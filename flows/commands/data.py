@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from extrags.errors import SourceNotFoundError, StoreError, UnknownSequenceError
+from extrags.errors import SourceNotFoundError, StoreError, UnknownSequenceError, reason_of
 from extrags.output_files import whole_file
 from flows.commands.common import counted, set_up_logging, write_json
 from flows.commands.options import Parser, add_json, add_sequence, add_settings, add_verb
@@ -234,7 +234,7 @@ def _write_picture(sequence: EndoscopicSequence, target: Path) -> None:
         with whole_file(target) as unfinished:
             Image.fromarray(contact_sheet(sequence)).save(unfinished)
     except (OSError, ValueError) as error:
-        raise StoreError(f"{target} cannot be written: {error}") from error
+        raise StoreError(f"{target} cannot be written: {reason_of(error)}") from error
 
 
 def _listed(value: Any) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from extrags.errors import ConfigError, StoreError
+from extrags.errors import ConfigError, StoreError, reason_of
 from extrags.output_files import whole_folder
 from flows.commands.common import counted, set_up_logging
 from flows.commands.export_scene import ALONG
@@ -235,7 +235,7 @@ def _sequence(given: argparse.Namespace) -> int:
                 binary = given.to == "colmap"
                 write_colmap(sequence, folder, binary=binary, points=points, points_rgb=points_rgb)
     except OSError as error:
-        raise StoreError(f"{target} cannot be written: {error.strerror or error}") from error
+        raise StoreError(f"{target} cannot be written: {reason_of(error)}") from error
     count = 0 if points is None else len(points)
     print(f"{target}: {counted(len(sequence), 'frame')} with poses, {counted(count, 'point')}")
     return 0

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from extrags.errors import ConfigError, ExtragsError, StoreError
+from extrags.errors import ConfigError, ExtragsError, StoreError, reason_of
 from flows.commands.common import finished_run, is_terminal, run_config, set_up_logging, showing
 from flows.commands.outputs import made_folder
 
@@ -50,7 +50,7 @@ def export_scene(given: argparse.Namespace) -> int:
             # Some are errors of files as well, and say themselves which one and why.
             raise
         except OSError as error:
-            raise StoreError(f"{target} cannot be written: {error.strerror or error}") from error
+            raise StoreError(f"{target} cannot be written: {reason_of(error)}") from error
     print(f"{target}: {said}")
     return 0
 

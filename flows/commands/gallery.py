@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from extrags import __version__
-from extrags.errors import ConfigError, StoreError
+from extrags.errors import ConfigError, StoreError, reason_of
 from extrags.source_commit import source_commit
 from flows.commands.common import existing_store, items, run_options, set_up_logging, without_folders
 from flows.commands.options import Parser, add_output, add_store
@@ -74,12 +74,13 @@ def gallery(given: argparse.Namespace) -> int:
     set_up_logging(debug=given.debug, terminal=True, quiet=given.quiet)
     store = existing_store(given)
     prepare(store.state, debug=given.debug, looks=True)
-    from flows.recorded_runs import gallery_run, last_runs
+    from flows.recorded_runs import gallery_run, last_runs, nearest_on_record
 
     chosen = last_runs(store, given.patterns, methods=items(given.methods), profiles=items(given.profiles))
     if not chosen:
         wanted = f" of {', '.join(given.patterns)}" if given.patterns else ""
-        raise StoreError(f"no finished run{wanted} is on record in {store.root}")
+        near = nearest_on_record(store, given.patterns)
+        raise StoreError(f"no finished run{wanted} is on record in {store.root}{near}")
     from extrags.report.gallery import build_gallery
 
     runs = [gallery_run(store, run) for run in chosen]
@@ -93,7 +94,8 @@ def gallery(given: argparse.Namespace) -> int:
             made=_made(),
         )
     except OSError as error:
-        raise StoreError(f"the gallery cannot be written: {error}") from error
+        file = error.filename or given.output
+        raise StoreError(f"the gallery cannot be written: {file}: {reason_of(error)}") from error
     print(page)
     return 0
 

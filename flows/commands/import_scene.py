@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from shlex import quote
 
 from extrags.errors import ConfigError, SourceNotFoundError
 from extrags.user_paths import absolute
@@ -38,9 +39,17 @@ def add_arguments(parser: Parser) -> None:
 
 
 def import_scene(given: argparse.Namespace) -> int:
-    """`extrags import`."""
+    """`extrags import`.
+
+    Raises:
+        SourceNotFoundError: when there is no such file.
+        ConfigError: when file and sequence are reversed, or a setting is given twice.
+    """
     from flows.commands.run import run
 
+    if _is_splat_file(given.sequence) and not _is_splat_file(given.file):
+        right = f"extrags import {quote(given.sequence)} --sequence {quote(given.file)}"
+        raise ConfigError(f"the scene and the sequence it belongs to are reversed; expected {right}")
     file = absolute(given.file)
     if not file.is_file():
         raise SourceNotFoundError("no such file", file=file)
@@ -53,3 +62,7 @@ def import_scene(given: argparse.Namespace) -> int:
         given.settings["imported.scale"] = given.units
     several = {"manifest": [], "at_once": 1, "only": None, "methods": [], "seeds": [], "matrix": []}
     return run(argparse.Namespace(**vars(given), **several, sequences=[given.sequence], always_flow=False))
+
+
+def _is_splat_file(path: str) -> bool:
+    return path.lower().endswith((".ply", ".spz")) and not absolute(path).is_dir()

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from extrags.errors import StoreError
+from extrags.errors import StoreError, reason_of
 from extrags.output_files import write_file
 from extrags.user_paths import expanded
 
@@ -123,4 +123,4 @@ def write_output(target: str, content: str | bytes) -> None:
         with made_folder(Path(target).parent):
             write_file(target, content)
     except OSError as error:
-        raise StoreError(f"{target} cannot be written: {error.strerror or error}") from error
+        raise StoreError(f"{target} cannot be written: {reason_of(error)}") from error

@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from extrags.errors import CaptureError, ConfigError, WeightsError
+from extrags.errors import CaptureError, ConfigError, WeightsError, reason_of
 from flows.commands.common import is_terminal, set_up_logging, showing, training_settings
 from flows.commands.options import Parser, add_output
 from flows.commands.outputs import output_folder
@@ -364,7 +364,7 @@ def checked(given: argparse.Namespace, scenes: int, validation_scenes: int, *, p
         try:
             Path(folder).mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise ConfigError(f"{folder} cannot be written: {error.strerror or error}") from error
+            raise ConfigError(f"{folder} cannot be written: {reason_of(error)}") from error
 
 
 def check_weights_there(folder: Path, backend: str) -> None:

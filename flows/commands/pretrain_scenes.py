@@ -12,7 +12,10 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
+from extrags import __version__
 from extrags.errors import CaptureError, DivergedError
+from extrags.output_files import write_file
+from extrags.source_commit import source_commit
 
 if TYPE_CHECKING:
     from data_catalog.cavities.pretraining import CavityConfig
@@ -134,6 +137,9 @@ def scene_sources(given: argparse.Namespace, count: int) -> list[SceneSource]:
 def make_scenes(folder: Path, sources: Sequence[SceneSource], workers: int) -> list[Path]:
     """Pretraining scenes as files; those that are there and made in the same way stay.
 
+    Why a scene cannot be made is kept beside it, and it is not tried again while it would be made in the same
+    way by the same version.
+
     Args:
         folder: where they are kept.
         sources: which scenes.
@@ -145,18 +151,48 @@ def make_scenes(folder: Path, sources: Sequence[SceneSource], workers: int) -> l
     from extrags.restoration.training_data.pretraining_scenes import PretrainingScene
 
     files = [folder / source.file_name for source in sources]
-    missing = [
-        (source, file)
-        for source, file in zip(sources, files, strict=True)
-        if PretrainingScene.made_from(file) != source.origin
-    ]
+    missing, failed = [], {}
+    for source, file in zip(sources, files, strict=True):
+        if PretrainingScene.made_from(file) == source.origin:
+            continue
+        reason = _recorded_failure(source, file)
+        if reason is None:
+            missing.append((source, file))
+        else:
+            record = _failure_file(file)
+            failed[file] = f"{reason} (an earlier attempt of this version, {record}; remove it to try again)"
     jobs = [partial(make_scene, source, file) for source, file in missing]
     reasons = in_processes(jobs, workers, "pretraining-scenes", done=len(files) - len(missing))
-    failed = {file: reason for (_, file), reason in zip(missing, reasons, strict=True) if reason is not None}
+    for (source, file), new in zip(missing, reasons, strict=True):
+        if new is None:
+            _failure_file(file).unlink(missing_ok=True)
+        else:
+            failed[file] = new
+            folder.mkdir(parents=True, exist_ok=True)
+            write_file(_failure_file(file), json.dumps({**_attempt(source), "reason": new}, indent=1) + "\n")
     for file, reason in failed.items():
         # Told here: what a process of its own logs goes past the progress bar.
         logger.warning("%s: left out, %s", file.stem, reason)
     return [file for file in files if file not in failed]
+
+
+def _failure_file(file: Path) -> Path:
+    return file.with_suffix(".failed.json")
+
+
+def _attempt(source: SceneSource) -> dict[str, str]:
+    """What decides whether a scene can be made; the version stands for the code of its reconstruction."""
+    return {"extrags": f"{__version__} {source_commit() or ''}".strip(), "origin": source.origin}
+
+
+def _recorded_failure(source: SceneSource, file: Path) -> str | None:
+    """Why an earlier attempt at the same scene failed; None where there was none, or it was another."""
+    try:
+        record = json.loads(_failure_file(file).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    same = isinstance(record, dict) and all(record.get(key) == told for key, told in _attempt(source).items())
+    return str(record["reason"]) if same and "reason" in record else None
 
 
 def make_scene(source: SceneSource, file: Path) -> str | None:

@@ -182,6 +182,17 @@ class TestReading:
         assert "3 of 10 images have no pose in the COLMAP model" in caplog.text
         assert "0007.png" in caplog.text
 
+    @pytest.mark.parametrize("place", ["sparse", "sparse/0"])
+    def test_the_model_alone_is_told_where_its_images_are(self, clip, tmp_path, place) -> None:
+        """It is recognised as a workspace without images, whose frames are all absent."""
+        workspace = tmp_path / "scene"
+        write_colmap(clip, workspace)
+        with pytest.raises(SourceError, match=f"the model alone, .*; give the folder {workspace}, which"):
+            read(workspace / place)
+        shutil.rmtree(workspace / "images")
+        with pytest.raises(SourceError, match=r"of them are absent"):
+            read(workspace / place)
+
     def test_recordings_are_folders(self, clip, tmp_path) -> None:
         two = replace(clip, recording=np.repeat([0, 1], 5))
         write_colmap(two, tmp_path / "scene")

@@ -117,6 +117,8 @@ class TestGaussians:
     def test_ply_errors(self, tmp_path: Path) -> None:
         with pytest.raises(SourceNotFoundError):
             Gaussians.read_ply(tmp_path / "none.ply")
+        with pytest.raises(SourceError, match=r"cannot be read: Is a directory$"):
+            Gaussians.read_ply(tmp_path)
         (tmp_path / "points.ply").write_text(
             "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\n"
             "property float z\nend_header\n0 0 0\n"

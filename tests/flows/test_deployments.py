@@ -44,6 +44,11 @@ class TestFile:
             assert store["default"] is None
             assert store["pattern"]
 
+    @pytest.mark.parametrize(("name", "reason"), [("", "Is a directory"), ("a.yaml", "No such file or")])
+    def test_what_is_no_file(self, name: str, reason: str, tmp_path: Path) -> None:
+        with pytest.raises(ConfigError, match=f"^{tmp_path / name} cannot be read: {reason}"):
+            declared_deployments(tmp_path / name)
+
     @pytest.mark.parametrize(
         ("text", "message"),
         [

@@ -138,6 +138,16 @@ class TestCommand:
         assert main([*again, "--imported.scene", str(theirs)]) == 0
         assert "without light" in capsys.readouterr().out
 
+    @pytest.mark.parametrize("first", [SEQUENCE, "{folder}"])
+    @pytest.mark.parametrize("second", ["none.ply", "{file}"])
+    def test_file_and_sequence_reversed(
+        self, first: str, second: str, theirs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        first, second = (part.format(file=theirs, folder=tmp_path) for part in (first, second))
+        assert main(["import", first, "--sequence", second, "--store", str(tmp_path / "store")]) == 2
+        said = capsys.readouterr().err
+        assert f"are reversed; expected extrags import {second} --sequence {first}" in said
+
     def test_with_the_cameras_of_a_colmap_folder(
         self, finished: Finished, theirs: Path, tmp_path: Path
     ) -> None:

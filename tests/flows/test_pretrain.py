@@ -100,6 +100,39 @@ def test_scenes_made_in_the_same_way_stay(scenes: Path, monkeypatch: pytest.Monk
     assert made == ["cavities_00000.safetensors"]
 
 
+def test_scenes_that_cannot_be_made_are_not_tried_again_by_the_same_version(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    wanted = sources()
+    tried: list[str] = []
+
+    def attempt(source: SceneSource, file: Path) -> str | None:
+        tried.append(file.stem)
+        return "nothing is seen" if file.stem == wanted[1].file_name.split(".")[0] else None
+
+    monkeypatch.setattr(pretrain_scenes, "ProcessPoolExecutor", _Here)
+    monkeypatch.setattr(pretrain_scenes, "_on_one_thread", lambda job: job())
+    monkeypatch.setattr(pretrain_scenes, "make_scene", attempt)
+    folder = tmp_path / "none" / "yet"
+    made = make_scenes(folder, wanted, workers=1)
+    assert len(made) == len(wanted) - 1
+    assert len(tried) == len(wanted)
+    failed = wanted[1].file_name.split(".")[0]
+    record = folder / f"{failed}.failed.json"
+    assert json.loads(record.read_text())["reason"] == "nothing is seen"
+    caplog.clear()
+    assert make_scenes(folder, wanted, workers=1) == made
+    assert tried.count(failed) == 1
+    assert f"{failed}: left out, nothing is seen (an earlier attempt of this version, {record}" in caplog.text
+    monkeypatch.setattr(pretrain_scenes, "__version__", "another")
+    make_scenes(folder, wanted, workers=1)
+    assert tried.count(failed) == 2
+    monkeypatch.setattr(pretrain_scenes, "make_scene", lambda source, file: None)
+    monkeypatch.setattr(pretrain_scenes, "__version__", "a third")
+    make_scenes(folder, wanted, workers=1)
+    assert not record.exists()
+
+
 def test_families_take_turns_and_do_not_share_numbers() -> None:
     names = [(source.family, source.index) for source in sources(("phantom", "cavities", "cavities"), 6)]
     assert names == [

@@ -92,7 +92,7 @@ def test_pages_are_named_by_file_folder_or_key(store: Store) -> None:
 def test_too_few_runs(store: Store) -> None:
     with pytest.raises(ConfigError, match=r"0 finished runs on record .* and 1 that did not come to a page"):
         chosen_runs(store, [SEQUENCE], methods=["3dgs"])
-    with pytest.raises(ConfigError, match="a comparison takes two"):
+    with pytest.raises(ConfigError, match=r"did you mean phantom/0@sparse\? A comparison takes two"):
         chosen_runs(store, ["phantom/7@sparse"])
     with pytest.raises(
         ConfigError, match=r"a matrix .*--matrix coarse\.iterations=150,300.*pages of two runs"
@@ -253,6 +253,8 @@ def test_the_command_of_a_gallery_has_its_options(store: Store, tmp_path: Path) 
     ("arguments", "message"),
     [
         (["compare", "phantom/7@sparse"], "0 finished runs on record"),
+        (["compare", SEQUENCE.replace("sparse", "sprase")], f"; did you mean {SEQUENCE}? A comp"),
+        (["gallery", SEQUENCE.replace("sparse", "sprase")], f"; did you mean {SEQUENCE}?"),
         (["compare", SEQUENCE, "--views", "0"], "--views 0: expected 1 or more"),
         (["gallery", "c3vd/*"], "no finished run of c3vd/* is on record"),
         (["gallery", "--kb", "0"], "--kb 0: expected 1 or more"),

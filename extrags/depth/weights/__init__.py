@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from extrags.array_files import load_safetensors
-from extrags.errors import WeightsError
+from extrags.errors import WeightsError, reason_of
 from extrags.user_paths import expanded
 
 if TYPE_CHECKING:
@@ -108,5 +108,5 @@ def _network(file: Path, wanted_for: str) -> CompletionNetwork:
     try:
         network.load_state_dict({name: value.float() for name, value in load_safetensors(file).items()})
     except (OSError, RuntimeError, ValueError) as error:
-        raise WeightsError(f"{wanted_for}: {file} is not a completion network: {error}") from error
+        raise WeightsError(f"{wanted_for}: {file} is not a completion network: {reason_of(error)}") from error
     return network.eval()

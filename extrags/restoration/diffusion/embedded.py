@@ -18,7 +18,7 @@ from extrags.config import EnhanceConfig
 from extrags.depth.completion import CompletionNetwork
 from extrags.depth.hidden import depth_from_image
 from extrags.depth.weights import hidden_digest, load_hidden
-from extrags.errors import ConfigError, WeightsError
+from extrags.errors import ConfigError, WeightsError, reason_of
 from extrags.restoration.description import description_fields, read_description, write_description
 from extrags.restoration.diffusion.frame_features import sequence_features
 from extrags.restoration.diffusion.network import RestorationNetwork, build_network
@@ -460,7 +460,9 @@ class EmbeddedEnhancer:
                 {name: value.float() for name, value in load_safetensors(weights_file).items()}
             )
         except (OSError, RuntimeError, ValueError) as error:
-            raise WeightsError(f"{weights_file}: not the weights of this network ({error})") from error
+            raise WeightsError(
+                f"{weights_file}: not the weights of this network ({reason_of(error)})"
+            ) from error
         return enhancer
 
 
@@ -485,7 +487,7 @@ def _read_patches(file: Path) -> Float[Tensor, "r 3 s s"] | None:
     try:
         return load_safetensors(file)["patches"].float() / COLOR_STEPS
     except (OSError, RuntimeError, ValueError, KeyError) as error:
-        raise WeightsError(f"{file}: not the patches of a scene's frames ({error})") from error
+        raise WeightsError(f"{file}: not the patches of a scene's frames ({reason_of(error)})") from error
 
 
 def _read_untrained(folder: Path) -> EmbeddedEnhancer | None:

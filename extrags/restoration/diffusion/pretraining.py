@@ -24,7 +24,7 @@ from extrags.array_files import load_safetensors, save_safetensors
 from extrags.config.base import Seed, StageConfig
 from extrags.config.restorer import LevelWidth
 from extrags.devices import chosen_device
-from extrags.errors import ConfigError, WeightsError
+from extrags.errors import ConfigError, WeightsError, reason_of
 from extrags.metrics.lpips import Lpips
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.diffusion.error_fit import with_error_model
@@ -374,8 +374,8 @@ def _go_on(training: NetworkTraining, file: Path, config: PretrainingConfig, now
         training.restore(state)
     except (OSError, RuntimeError, ValueError, KeyError, TypeError) as error:
         raise WeightsError(
-            f"{file}: not a checkpoint of this training ({error}); give the same settings and start, or "
-            "remove it to begin anew"
+            f"{file}: not a checkpoint of this training ({reason_of(error)}); give the same settings and "
+            "start, or remove it to begin anew"
         ) from error
     return replace(began, resumed=(*began.resumed, now.about))
 

@@ -16,7 +16,7 @@ from extrags.cameras import Cameras
 from extrags.config import PipelineConfig
 from extrags.depth.hidden import SOLID, reading_inputs, reading_size, shrunk, shrunk_intrinsics
 from extrags.depth.pretraining.examples import Examples
-from extrags.errors import CaptureError, WeightsError
+from extrags.errors import CaptureError, WeightsError, reason_of
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.training_data.degradation import Degradation
 from extrags.restoration.training_data.explored_views import explored_cameras
@@ -160,7 +160,7 @@ class HiddenDepthExamples:
         try:
             return cls(**load_safetensors(path))
         except (OSError, RuntimeError, ValueError, TypeError) as error:
-            raise WeightsError(f"{path}: no views with hidden depth ({error})") from error
+            raise WeightsError(f"{path}: no views with hidden depth ({reason_of(error)})") from error
 
 
 def _true_depths_mm(

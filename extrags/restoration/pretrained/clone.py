@@ -15,7 +15,7 @@ import numpy as np
 
 from extrags.array_files import load_npz
 from extrags.config import CheckpointConfig
-from extrags.errors import ConfigError, ExtragsError, MissingDependencyError, WeightsError
+from extrags.errors import ConfigError, ExtragsError, MissingDependencyError, WeightsError, reason_of
 from extrags.model_files import files_fingerprint
 from extrags.restoration.pretrained import checkpoint_driver
 from extrags.restoration.pretrained.captions import KEY_VARIABLE
@@ -205,7 +205,9 @@ def run_clone(
                 f"(enhance.checkpoint.timeout_s). {_tail(error.stderr)}"
             ) from error
         except OSError as error:
-            raise ConfigError(f"enhance.checkpoint.python={clone.python}: cannot be run ({error})") from error
+            raise ConfigError(
+                f"enhance.checkpoint.python={clone.python}: cannot be run ({reason_of(error)})"
+            ) from error
         failure = Path(f"{result}.json")
         if ended.returncode == checkpoint_driver.KNOWN_FAILURE and failure.is_file():
             told = json.loads(failure.read_text())
@@ -219,7 +221,9 @@ def run_clone(
         try:
             return np.asarray(load_npz(result)["frames"], dtype=np.float32)
         except (OSError, KeyError, ValueError) as error:
-            raise ExtragsError(f"the clone {clone.root} wrote no readable result: {error}") from error
+            raise ExtragsError(
+                f"the clone {clone.root} wrote no readable result: {reason_of(error)}"
+            ) from error
 
 
 def _environment(python: str) -> dict[str, str]:

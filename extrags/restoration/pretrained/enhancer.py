@@ -16,7 +16,7 @@ from torch import Tensor
 
 from extrags.array_files import load_safetensors, save_safetensors
 from extrags.config import CoarseConfig, EnhanceConfig, PretrainedConfig
-from extrags.errors import ConfigError, WeightsError
+from extrags.errors import ConfigError, WeightsError, reason_of
 from extrags.model_files import fingerprint
 from extrags.restoration.clips import keep_known
 from extrags.restoration.description import DESCRIPTION, description_fields, text_field
@@ -211,7 +211,7 @@ class DiffusersBackend:
         try:
             text = load_safetensors(path / TEXT)
         except (OSError, ValueError) as error:
-            raise WeightsError(f"{path / TEXT}: not readable as safetensors ({error})") from error
+            raise WeightsError(f"{path / TEXT}: not readable as safetensors ({reason_of(error)})") from error
         with description_fields(path / DESCRIPTION):
             return PretrainedEnhancer(
                 settings=PretrainedConfig.model_validate(description["settings"]),

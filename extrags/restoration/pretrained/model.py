@@ -17,7 +17,7 @@ import torch
 
 from extrags.config import PretrainedConfig
 from extrags.devices import chosen_device
-from extrags.errors import ConfigError, MissingDependencyError, WeightsError, installed_with
+from extrags.errors import ConfigError, MissingDependencyError, WeightsError, installed_with, reason_of
 from extrags.restoration.pretrained.parts import missing_part
 from extrags.user_paths import expanded
 
@@ -238,7 +238,7 @@ def load_pipeline(
                 **options,
             )
     except (OSError, ValueError, KeyError, RuntimeError) as error:
-        raise WeightsError(f"{folder}: not loadable as a {rule.pipeline}: {error}") from error
+        raise WeightsError(f"{folder}: not loadable as a {rule.pipeline}: {reason_of(error)}") from error
     pipeline.set_progress_bar_config(disable=True)
     if settings.offload == "model":
         pipeline.enable_model_cpu_offload(device=device)

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from extrags.array_files import load_safetensors, save_safetensors
-from extrags.errors import CaptureError, WeightsError
+from extrags.errors import CaptureError, WeightsError, reason_of
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.diffusion.network import SIZE_MULTIPLE
 from extrags.restoration.refinement.refiner import refiner_conditioning, relative_depth
@@ -104,7 +104,7 @@ class RefinementExamples:
         try:
             return cls(**load_safetensors(path))
         except (OSError, RuntimeError, ValueError, TypeError) as error:
-            raise WeightsError(f"{path}: not the examples of a refiner ({error})") from error
+            raise WeightsError(f"{path}: not the examples of a refiner ({reason_of(error)})") from error
 
 
 class ExampleCrops:

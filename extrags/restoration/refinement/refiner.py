@@ -24,7 +24,7 @@ from torch.nn import functional
 
 from extrags.array_files import load_safetensors, save_safetensors
 from extrags.cameras import Cameras
-from extrags.errors import WeightsError
+from extrags.errors import WeightsError, reason_of
 from extrags.metrics.filters import filter_separable, gaussian_weights
 from extrags.restoration.description import (
     DESCRIPTION,
@@ -227,7 +227,9 @@ class Refiner:
                 {name: value.float() for name, value in load_safetensors(path / WEIGHTS).items()}
             )
         except (OSError, RuntimeError, ValueError) as error:
-            raise WeightsError(f"{path / WEIGHTS}: not the weights of a refiner ({error})") from error
+            raise WeightsError(
+                f"{path / WEIGHTS}: not the weights of a refiner ({reason_of(error)})"
+            ) from error
         return cls(network.eval(), record, half_precision=half_precision)
 
 

@@ -19,7 +19,7 @@ from torch.nn import functional
 from extrags.array_files import save_safetensors
 from extrags.cameras import Cameras
 from extrags.config import PipelineConfig
-from extrags.errors import ShapeError, WeightsError
+from extrags.errors import ShapeError, WeightsError, reason_of
 from extrags.illumination import NearFieldLight
 from extrags.restoration.surface_texture import SurfaceTexture
 from extrags.restoration.training_data.augmentation import unconfirmed
@@ -168,7 +168,9 @@ class PretrainingScene:
             with safe_open(str(path), "pt") as file:
                 height, width = file.get_slice("target").get_shape()[-2:]
         except (OSError, SafetensorError, ValueError) as error:
-            raise WeightsError(f"{path}: not the pairs of a pretraining scene ({error})") from error
+            raise WeightsError(
+                f"{path}: not the pairs of a pretraining scene ({reason_of(error)})"
+            ) from error
         return int(height), int(width)
 
     @classmethod
@@ -219,7 +221,9 @@ class PretrainingScene:
         except WeightsError:
             raise
         except (OSError, SafetensorError, KeyError, ValueError, TypeError, ShapeError) as error:
-            raise WeightsError(f"{path}: not the pairs of a pretraining scene ({error})") from error
+            raise WeightsError(
+                f"{path}: not the pairs of a pretraining scene ({reason_of(error)})"
+            ) from error
 
 
 def make_pretraining_scene(

@@ -1,14 +1,14 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from extrags.report import ReportInputs
+from extrags.report import ReportInputs, charts
 from extrags.report.chart_labels import LONGEST_LABEL, row_labels
 from extrags.report.charts import (
     COARSE_COLOR,
@@ -26,6 +26,47 @@ from extrags.report.fronts_plot import write_fronts_plot
 from extrags.report.run_comparison import ComparedRun, build_run_comparison
 from extrags.report.trend import trend_chart
 from tests.extrags.report.conftest import result_of
+
+
+def svg(chart: Chart) -> str:
+    return base64.b64decode(chart.uri.partition("base64,")[2]).decode()
+
+
+def chart_of(name: str) -> str:
+    values = np.array([20.0, 21.0])
+    return svg(sequences_chart([name, "phantom/0"], values, values + 1, values))
+
+
+class TestLettersOfOtherScripts:
+    @pytest.fixture
+    def fonts(self, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., None]]:
+        """Chooses the further fonts of this machine."""
+
+        def chosen(*names: str) -> None:
+            monkeypatch.setattr(charts, "_FURTHER_FONTS", names)
+            forget()
+
+        def forget() -> None:
+            charts._families.cache_clear()
+            charts._letters.cache_clear()
+
+        yield chosen
+        forget()
+
+    def test_text_stays_text_where_no_font_has_them(self, fonts: Callable[..., None]) -> None:
+        """Its letters were drawn as boxes."""
+        fonts()
+        drawn = chart_of("结肠/腸")
+        assert "结肠/腸</text>" in drawn
+        assert "sans-serif" in drawn
+        assert "<text" not in chart_of("côlon/Darm/кишка")
+
+    def test_another_font_has_them(self, fonts: Callable[..., None]) -> None:
+        letter = "\u1d81"  # In a font that comes with matplotlib, and not in that of charts.
+        fonts()
+        assert f"{letter}</text>" in chart_of(letter)
+        fonts("No Such Font", "STIXGeneral")
+        assert "<text" not in chart_of(letter)
 
 
 def numbers(chart: Chart) -> list[str]:

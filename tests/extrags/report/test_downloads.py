@@ -29,6 +29,13 @@ def test_csv_is_quoted_and_what_is_missing_is_empty() -> None:
     assert text == 'name,value\r\n"a ""b"", c",\r\nd,0.333333333\r\ne,\r\nf,12\r\n'
 
 
+def test_names_of_others_are_no_formulas() -> None:
+    rows = [["=1+1", -0.5], ["@a", -3], ["-0.5", "+x"], ["\ta", "a=b"]]
+    assert csv_text(["=run", "value"], rows) == (
+        "'=run,value\r\n'=1+1,-0.5\r\n'@a,-3\r\n-0.5,'+x\r\n'\ta,a=b\r\n"
+    )
+
+
 def test_file_names_are_plain() -> None:
     assert file_name("PSNR, never observed (dB)") == "psnr_never_observed_db"
 
