@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from extrags.report.chart_labels import row_labels
+from extrags.report.chart_labels import drawable, row_labels
 from extrags.report.downloads import Cell, Chart, file_name
 from extrags.report.encode import data_uri
 
@@ -104,6 +104,10 @@ def drawing_style() -> Iterator[None]:
 
 def svg_image(figure: Any) -> Chart:
     """A figure as an SVG data URI without date or random names; call inside `drawing_style`."""
+    from matplotlib.text import Text
+
+    for text in figure.findobj(Text):
+        text.set_text(drawable(text.get_text()))
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None}, transparent=True)
     text = _LONG_PATHS.sub(lambda path: _LONG_FRACTION.sub(r"\1", path.group()), buffer.getvalue())
