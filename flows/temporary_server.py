@@ -16,8 +16,10 @@ from __future__ import annotations
 
 import asyncio
 import atexit
+import errno
 import logging
 import os
+import resource
 import socket
 import sqlite3
 import subprocess
@@ -25,7 +27,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from importlib import metadata
 from pathlib import Path
 from tempfile import NamedTemporaryFile, TemporaryDirectory
@@ -73,6 +75,11 @@ def start_early() -> None:
     (`flows.environment.prepare`); where Prefect then knows another server, this one ends.
     """
     if not _starting and not _started and not os.environ.get("PREFECT_API_URL"):
+        # Without room for its database it would end with a traceback; whoever comes to need it is told why.
+        try:
+            _check_room(Path(os.environ["PREFECT_HOME"]))
+        except ServerError:
+            return
         address, process = _launch({})
         _starting[address] = process
 
@@ -124,9 +131,17 @@ def _check_room(home: Path) -> None:
     """Write into the folder of the database as much as would be missed.
 
     Raises:
-        ServerError: when that cannot be written, with the reason.
+        ServerError: when that cannot be written, or the database has grown to what a file may hold, with the
+            reason.
     """
+    limit, _ = resource.getrlimit(resource.RLIMIT_FSIZE)
+    largest = 0
+    with suppress(OSError):
+        largest = max((file.stat().st_size for file in home.glob(f"{DATABASE}*")), default=0)
     try:
+        if limit != resource.RLIM_INFINITY and largest + ROOM_BYTES > limit:
+            reason = f"{os.strerror(errno.EFBIG)}: no more than {limit} bytes are allowed, see ulimit -f"
+            raise OSError(errno.EFBIG, reason)
         with NamedTemporaryFile(dir=home) as probe:
             probe.write(bytes(ROOM_BYTES))
             probe.flush()
@@ -139,6 +154,20 @@ def _check_room(home: Path) -> None:
         ) from error
 
 
+def _check_home() -> None:
+    """As `_check_room`, where Prefect's home holds the database, and is there.
+
+    Raises:
+        ServerError: when it cannot be written.
+    """
+    from prefect.settings import PREFECT_API_DATABASE_CONNECTION_URL, PREFECT_HOME
+
+    home = PREFECT_HOME.value()
+    address = str(PREFECT_API_DATABASE_CONNECTION_URL.value())
+    if home.is_dir() and address.endswith((f"/{home / DATABASE}", f"/{_in_address(home / DATABASE)}")):
+        _check_room(home)
+
+
 def _start() -> str:
     from prefect.settings import PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS, get_current_settings
 
@@ -146,6 +175,7 @@ def _start() -> str:
     if _starting:
         address, process = _starting.popitem()
     else:
+        _check_home()
         address, process = _launch(get_current_settings().to_environment_variables(exclude_unset=True))
     _wait(process, address, limit_s)
     _started.clear()
@@ -197,6 +227,7 @@ def _wait(process: subprocess.Popen[bytes], address: str, limit_s: float) -> Non
     with httpx.Client() as client:
         while time.monotonic() < end:
             if process.poll() is not None:
+                _check_home()
                 raise ServerError(f"Prefect's temporary server ended at once with code {process.returncode}")
             try:
                 if client.get(f"{address}/health").status_code == httpx.codes.OK:

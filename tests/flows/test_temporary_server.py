@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 import sqlite3
 import subprocess
 from contextlib import closing
@@ -11,6 +12,7 @@ import httpx
 import pytest
 from prefect.exceptions import PrefectHTTPStatusError
 from prefect.settings import (
+    PREFECT_API_DATABASE_CONNECTION_URL,
     PREFECT_API_URL,
     PREFECT_HOME,
     PREFECT_SERVER_EPHEMERAL_ENABLED,
@@ -96,6 +98,57 @@ def test_a_server_that_fails_because_it_cannot_write_says_so(
         server.wait()
     if told is ServerError:
         assert "cannot be written (No such file or directory)" in str(raised.value)
+
+
+def test_a_database_as_large_as_a_file_may_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Others can still be written beside it: the limit alone tells why the server fails."""
+    (tmp_path / DATABASE).write_bytes(bytes(1000))
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (server_module.ROOM_BYTES + 1000, 1 << 30))
+    server_module._check_room(tmp_path)
+    (tmp_path / f"{DATABASE}-wal").write_bytes(bytes(2000))
+    with pytest.raises(ServerError, match=r"\(File too large: no more than 1049576 bytes .* ulimit -f\)"):
+        server_module._check_room(tmp_path)
+
+
+def test_a_server_that_has_no_room_from_the_beginning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It would end with a traceback, and its code says nothing."""
+    monkeypatch.delenv("PREFECT_API_URL", raising=False)
+    monkeypatch.setenv("PREFECT_HOME", str(tmp_path))
+    monkeypatch.setattr(server_module, "_started", {})
+    monkeypatch.setattr(server_module, "_launch", lambda settings: pytest.fail("it was started"))
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (1000, 1000))
+    server_module.start_early()
+    settings = {
+        PREFECT_API_URL: None,
+        PREFECT_SERVER_EPHEMERAL_ENABLED: True,
+        PREFECT_HOME: tmp_path,
+        PREFECT_API_DATABASE_CONNECTION_URL: f"sqlite+aiosqlite:///{tmp_path / DATABASE}",
+    }
+    with (
+        temporary_settings(settings),
+        pytest.raises(ServerError, match="cannot be written"),
+        temporary_server(),
+    ):
+        pytest.fail("there is no server")
+
+
+def test_a_server_that_ends_at_once_for_want_of_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    server = subprocess.Popen(["false"])
+    server.wait()
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (1000, 1000))
+    settings = {
+        PREFECT_HOME: tmp_path,
+        PREFECT_API_DATABASE_CONNECTION_URL: f"sqlite+aiosqlite:///{tmp_path / DATABASE}",
+    }
+    with temporary_settings(settings), pytest.raises(ServerError, match="cannot be written"):
+        server_module._wait(server, "http://127.0.0.1:9/api", 5)
+    with (
+        temporary_settings({**settings, PREFECT_HOME: tmp_path / "another"}),
+        pytest.raises(ServerError, match="ended at once with code 1"),
+    ):
+        server_module._wait(server, "http://127.0.0.1:9/api", 5)
 
 
 def test_pages_of_other_sites_are_told_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
