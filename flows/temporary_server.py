@@ -62,6 +62,11 @@ _started: dict[str, subprocess.Popen[bytes]] = {}
 CORS_VARIABLES = ("PREFECT_SERVER_API_CORS_ALLOWED_ORIGINS", "PREFECT_SERVER_CORS_ALLOWED_ORIGINS")
 """Both names of the setting that lets pages of other sites read what the server answers. By default, those of
 all sites may: what any of them, open in a browser meanwhile, asked for the runs of this machine was told."""
+TOKEN_VARIABLE = "PREFECT_SERVER_CSRF_PROTECTION_ENABLED"
+"""The setting by which the server takes changes only from who has asked it for a token and read the answer.
+Pages of other sites cannot read it, but send anything they may, and plain text is taken for JSON."""
+TOKEN_OF_CLIENTS = "PREFECT_CLIENT_CSRF_SUPPORT_ENABLED"
+"""Whether Prefect's clients ask for the token; by default they do."""
 
 
 class ServerError(ExtragsError, RuntimeError):
@@ -201,6 +206,8 @@ def _launch(settings: dict[str, str]) -> tuple[str, subprocess.Popen[bytes]]:
         "PREFECT_SERVER_MEMOIZE_BLOCK_AUTO_REGISTRATION": "false",
         "PYTHONPATH": os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])]),
     }
+    if environment.get(TOKEN_OF_CLIENTS, "true").lower() in ("1", "true", "yes", "on", "t", "y"):
+        environment[TOKEN_VARIABLE] = "true"
     environment |= database_address(environment)
     # The port is taken here and handed over, so that nobody else can take it meanwhile.
     with socket.socket() as listener:

@@ -151,20 +151,47 @@ def test_a_server_that_ends_at_once_for_want_of_room(tmp_path: Path, monkeypatch
         server_module._wait(server, "http://127.0.0.1:9/api", 5)
 
 
-def test_pages_of_other_sites_are_told_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    from prefect.settings import get_current_settings
-
-    given: dict[str, str] = {}
+@pytest.fixture
+def given(monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
+    """The environment of a server that is launched, but not started."""
+    found: dict[str, str] = {}
 
     class Process:
         def __init__(self, command: list[str], *, env: dict[str, str], **_: object) -> None:
-            given.update(env)
+            found.update(env)
 
     monkeypatch.setattr(subprocess, "Popen", Process)
     monkeypatch.setattr(server_module.atexit, "register", lambda *_: None)
+    return found
+
+
+def test_pages_of_other_sites_are_told_nothing(
+    given: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from prefect.settings import get_current_settings
+
     # As somebody's own server is told to.
     address, _ = server_module._launch({"PREFECT_SERVER_CORS_ALLOWED_ORIGINS": "*"})
     for name in server_module.CORS_VARIABLES:
         monkeypatch.setenv(name, given[name])
     allowed = type(get_current_settings())().server.api.cors_allowed_origins
     assert allowed == address.removesuffix("/api")
+
+
+@pytest.mark.parametrize("support", ["true", "false"])
+def test_pages_of_other_sites_change_nothing(
+    given: dict[str, str], monkeypatch: pytest.MonkeyPatch, support: str
+) -> None:
+    """Where clients ask for no token, the server cannot ask for one."""
+    from prefect.settings import get_current_settings
+
+    for name in (server_module.TOKEN_VARIABLE, server_module.TOKEN_OF_CLIENTS):
+        monkeypatch.delenv(name, raising=False)
+    assert get_current_settings().client.csrf_support_enabled
+    server_module._launch({} if support == "true" else {server_module.TOKEN_OF_CLIENTS: support})
+    for name in {server_module.TOKEN_VARIABLE, server_module.TOKEN_OF_CLIENTS} & given.keys():
+        monkeypatch.setenv(name, given[name])
+    found = type(get_current_settings())()
+    assert (
+        found.server.api.csrf_protection_enabled == found.client.csrf_support_enabled == (support == "true")
+    )
