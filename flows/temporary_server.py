@@ -145,8 +145,8 @@ def _check_room(home: Path) -> None:
         largest = max((file.stat().st_size for file in home.glob(f"{DATABASE}*")), default=0)
     try:
         if limit != resource.RLIM_INFINITY and largest + ROOM_BYTES > limit:
-            reason = f"{os.strerror(errno.EFBIG)}: no more than {limit} bytes are allowed, see ulimit -f"
-            raise OSError(errno.EFBIG, reason)
+            said = f"{os.strerror(errno.EFBIG)}: no more than {limit} bytes are allowed, see ulimit -f"
+            raise OSError(errno.EFBIG, said)
         with NamedTemporaryFile(dir=home) as probe:
             probe.write(bytes(ROOM_BYTES))
             probe.flush()
