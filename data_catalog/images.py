@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from data_catalog.inside import inside
-from extrags.array_files import load_npy
+from extrags.array_files import MOST_PIXELS, TOO_MANY_PIXELS, load_npy
 from extrags.errors import SourceError, SourceNotFoundError, reason_of
 from extrags.events import Progress, emit
 from extrags.frame_names import COLOR_SUFFIXES, NameOrder
@@ -267,7 +267,7 @@ def read_depth(file: Path, *, frame: object = None) -> Float[np.ndarray, "h w"]:
         if not file.is_file():
             raise SourceNotFoundError("no such file", file=file, frame=frame, field="depth")
         try:
-            values = load_npy(file)
+            values = load_npy(file, most=MOST_PIXELS)
         except (ValueError, OSError) as error:
             raise SourceError(
                 f"cannot be read: {reason_of(error)}", file=file, frame=frame, field="depth"
@@ -412,6 +412,8 @@ def _image_errors(file: Path, frame: object, field: str) -> Iterator[None]:
             frame=frame,
             field=field,
         ) from error
+    except Image.DecompressionBombError as error:
+        raise SourceError(TOO_MANY_PIXELS, file=file, frame=frame, field=field) from error
     except (
         OSError,
         SyntaxError,
@@ -426,7 +428,6 @@ def _image_errors(file: Path, frame: object, field: str) -> Iterator[None]:
         NotImplementedError,
         ZeroDivisionError,
         struct.error,
-        Image.DecompressionBombError,
     ) as error:
         # Pillow reports damage inside an image as any of these.
         raise SourceError(

@@ -17,9 +17,9 @@ from extrags.output_files import whole_file
 if TYPE_CHECKING:
     from torch import Tensor
 
-_PLY_HEADER_BYTES = 1 << 16
-
 __all__ = [
+    "MOST_PIXELS",
+    "TOO_MANY_PIXELS",
     "load_npy",
     "load_npz",
     "load_ply_vertices",
@@ -28,13 +28,25 @@ __all__ = [
     "save_safetensors",
 ]
 
+MOST_PIXELS = 178_956_970
+"""Of an image or a depth map that is read. Pillow takes a larger one for a file made to fill the memory."""
+TOO_MANY_PIXELS = f"too large: more than the {MOST_PIXELS} pixels that are read"
+_PLY_HEADER_BYTES = 1 << 16
+_MOST_UNPACKED_BYTES = 1 << 30
+_MOST_UNPACKED_SHARE = 100
+"""Of its own size: numbers that were measured or trained are packed to no less than a tenth."""
 
-def load_npy(file: Path) -> np.ndarray:
+
+def load_npy(file: Path, *, most: int | None = None) -> np.ndarray:
     """One array.
+
+    Args:
+        file: to read.
+        most: numbers that it may hold, looked at before any is read; None for any.
 
     Raises:
         OSError: when the file cannot be read.
-        ValueError: when it is damaged, holds Python objects, or announces more than there is.
+        ValueError: when it is damaged, holds Python objects, or announces more than there is or may be.
     """
     try:
         with file.open("rb") as stream:
@@ -51,6 +63,8 @@ def load_npy(file: Path) -> np.ndarray:
             there = file.stat().st_size - stream.tell()
         if kind.hasobject:
             raise ValueError("it holds Python objects (a pickle), which are never loaded")
+        if most is not None and announced > most * kind.itemsize:
+            raise ValueError(f"{' x '.join(map(str, shape))} numbers, more than the {most} that are read")
         if announced > there:
             raise ValueError(f"{announced} bytes of values announced, {there} there: it is truncated")
         return np.asarray(np.load(file, allow_pickle=False))
@@ -66,10 +80,15 @@ def load_npz(file: Path) -> dict[str, np.ndarray]:
 
     Raises:
         OSError: when the file cannot be read.
-        ValueError: when it is damaged or holds Python objects.
+        ValueError: when it is damaged, holds Python objects, or would fill the memory from few bytes.
     """
     try:
         with np.load(file, allow_pickle=False) as archive:
+            unpacked = sum(member.file_size for member in archive.zip.infolist())
+            if unpacked > max(_MOST_UNPACKED_BYTES, _MOST_UNPACKED_SHARE * file.stat().st_size):
+                raise ValueError(
+                    f"{file.stat().st_size} bytes that unpack to {unpacked}: made to fill the memory"
+                )
             found = {name: archive[name] for name in archive.files}
         # Members that are no npy files come back as bytes.
         if not all(isinstance(value, np.ndarray) for value in found.values()):

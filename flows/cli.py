@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+import warnings
 from collections.abc import Sequence
 from contextlib import suppress
 from importlib import import_module
@@ -106,6 +107,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments is None:
         # Signals, streams and the end belong to the process: they are handled where the command is all of it.
         set_up_streams()
+        if "--debug" not in sys.argv and not sys.warnoptions:
+            # What libraries warn their callers of, names of their files with it, tells a user nothing, breaks
+            # the display of a run, and is no error that `--quiet` leaves.
+            warnings.simplefilter("ignore")
         end = ProcessEnd()
         with interruptible():
             end.code = code = main(sys.argv[1:])

@@ -16,8 +16,10 @@ from __future__ import annotations
 
 import asyncio
 import atexit
+import errno
 import logging
 import os
+import resource
 import socket
 import sqlite3
 import subprocess
@@ -25,7 +27,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from importlib import metadata
 from pathlib import Path
 from tempfile import NamedTemporaryFile, TemporaryDirectory
@@ -60,6 +62,11 @@ _started: dict[str, subprocess.Popen[bytes]] = {}
 CORS_VARIABLES = ("PREFECT_SERVER_API_CORS_ALLOWED_ORIGINS", "PREFECT_SERVER_CORS_ALLOWED_ORIGINS")
 """Both names of the setting that lets pages of other sites read what the server answers. By default, those of
 all sites may: what any of them, open in a browser meanwhile, asked for the runs of this machine was told."""
+TOKEN_VARIABLE = "PREFECT_SERVER_CSRF_PROTECTION_ENABLED"
+"""The setting by which the server takes changes only from who has asked it for a token and read the answer.
+Pages of other sites cannot read it, but send anything they may, and plain text is taken for JSON."""
+TOKEN_OF_CLIENTS = "PREFECT_CLIENT_CSRF_SUPPORT_ENABLED"
+"""Whether Prefect's clients ask for the token; by default they do."""
 
 
 class ServerError(ExtragsError, RuntimeError):
@@ -73,6 +80,11 @@ def start_early() -> None:
     (`flows.environment.prepare`); where Prefect then knows another server, this one ends.
     """
     if not _starting and not _started and not os.environ.get("PREFECT_API_URL"):
+        # Without room for its database it would end with a traceback; whoever comes to need it is told why.
+        try:
+            _check_room(Path(os.environ["PREFECT_HOME"]))
+        except ServerError:
+            return
         address, process = _launch({})
         _starting[address] = process
 
@@ -124,9 +136,17 @@ def _check_room(home: Path) -> None:
     """Write into the folder of the database as much as would be missed.
 
     Raises:
-        ServerError: when that cannot be written, with the reason.
+        ServerError: when that cannot be written, or the database has grown to what a file may hold, with the
+            reason.
     """
+    limit, _ = resource.getrlimit(resource.RLIMIT_FSIZE)
+    largest = 0
+    with suppress(OSError):
+        largest = max((file.stat().st_size for file in home.glob(f"{DATABASE}*")), default=0)
     try:
+        if limit != resource.RLIM_INFINITY and largest + ROOM_BYTES > limit:
+            said = f"{os.strerror(errno.EFBIG)}: no more than {limit} bytes are allowed, see ulimit -f"
+            raise OSError(errno.EFBIG, said)
         with NamedTemporaryFile(dir=home) as probe:
             probe.write(bytes(ROOM_BYTES))
             probe.flush()
@@ -139,6 +159,20 @@ def _check_room(home: Path) -> None:
         ) from error
 
 
+def _check_home() -> None:
+    """As `_check_room`, where Prefect's home holds the database, and is there.
+
+    Raises:
+        ServerError: when it cannot be written.
+    """
+    from prefect.settings import PREFECT_API_DATABASE_CONNECTION_URL, PREFECT_HOME
+
+    home = PREFECT_HOME.value()
+    address = str(PREFECT_API_DATABASE_CONNECTION_URL.value())
+    if home.is_dir() and address.endswith((f"/{home / DATABASE}", f"/{_in_address(home / DATABASE)}")):
+        _check_room(home)
+
+
 def _start() -> str:
     from prefect.settings import PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS, get_current_settings
 
@@ -146,6 +180,7 @@ def _start() -> str:
     if _starting:
         address, process = _starting.popitem()
     else:
+        _check_home()
         address, process = _launch(get_current_settings().to_environment_variables(exclude_unset=True))
     _wait(process, address, limit_s)
     _started.clear()
@@ -171,6 +206,8 @@ def _launch(settings: dict[str, str]) -> tuple[str, subprocess.Popen[bytes]]:
         "PREFECT_SERVER_MEMOIZE_BLOCK_AUTO_REGISTRATION": "false",
         "PYTHONPATH": os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])]),
     }
+    if environment.get(TOKEN_OF_CLIENTS, "true").lower() in ("1", "true", "yes", "on", "t", "y"):
+        environment[TOKEN_VARIABLE] = "true"
     environment |= database_address(environment)
     # The port is taken here and handed over, so that nobody else can take it meanwhile.
     with socket.socket() as listener:
@@ -197,6 +234,7 @@ def _wait(process: subprocess.Popen[bytes], address: str, limit_s: float) -> Non
     with httpx.Client() as client:
         while time.monotonic() < end:
             if process.poll() is not None:
+                _check_home()
                 raise ServerError(f"Prefect's temporary server ended at once with code {process.returncode}")
             try:
                 if client.get(f"{address}/health").status_code == httpx.codes.OK:

@@ -302,8 +302,18 @@ def write_colmap(
 
     Raises:
         ShapeError: while the sequence has no poses.
+        SourceError: a frame's name has a line break, or leads out of the folder.
     """
     cameras = sequence.cameras
+    for index in range(len(sequence)):
+        if any(letter in sequence.frame_name(index) for letter in "\r\n"):
+            raise SourceError(
+                f"{sequence.frame_name(index)!r} has a line break, and a workspace lists names line by line; "
+                "rename the frame",
+                file=folder,
+                frame=index,
+                field="name",
+            )
     if points is None:
         points, points_rgb = sequence.points, sequence.points_rgb
     names = save_images(sequence, folder)

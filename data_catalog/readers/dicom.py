@@ -38,6 +38,7 @@ from data_catalog.footage import DICOM_SUFFIXES, Footage, FootageFrame, TimeSpan
 from data_catalog.posed_frames import SourceFrames
 from data_catalog.readers.footage_frames import footage_frames, footage_outline
 from data_catalog.readers.video import VideoFile, files_meant, footage_meant, with_files_beside
+from extrags.array_files import MOST_PIXELS, TOO_MANY_PIXELS
 from extrags.config import IngestConfig
 from extrags.errors import (
     ExtragsError,
@@ -113,6 +114,7 @@ class DicomFile:
         self._times_s: list[float] = _times_s(header, self._announced, file).tolist()
         self._pixel_aspect = _pixel_aspect(header)
         self._size = int(header.Columns), int(header.Rows)
+        self._check_size()
 
     @property
     def file(self) -> Path:
@@ -163,6 +165,22 @@ class DicomFile:
                     frame=number,
                 )
             yield FootageFrame(number, self._times_s[number], self._rgb(pixels))
+
+    def _check_size(self) -> None:
+        """Refuse what the file cannot hold, and what would fill the memory, before anything is decoded."""
+        (columns, rows), there = self._size, self._file.stat().st_size
+        if columns * rows > MOST_PIXELS:
+            raise SourceError(
+                f"frames of {columns} x {rows} pixels, {TOO_MANY_PIXELS}", file=self._file, field="Rows"
+            )
+        # A pixel takes a bit at least.
+        if not self._is_compressed and columns * rows > 8 * there:
+            raise SourceError(
+                f"frames of {columns} x {rows} pixels, not compressed, in {there} bytes: the file is damaged "
+                "or truncated",
+                file=self._file,
+                field="Rows",
+            )
 
     def _plain(self, wanted: Sequence[int]) -> Iterator[np.ndarray]:
         from pydicom.pixels.utils import pixel_array
@@ -215,11 +233,25 @@ def open_dicom(file: Path) -> Footage:
             f"{file.name}: DICOM files need pydicom: not installed. Install with: {installed_with('dicom')}"
         )
     from pydicom import dcmread
-    from pydicom.uid import HEVCM10P51, HEVCMP51, MPEGTransferSyntaxes
+    from pydicom.filereader import read_file_meta_info
+    from pydicom.uid import (
+        HEVCM10P51,
+        HEVCMP51,
+        DeflatedExplicitVRLittleEndian,
+        MPEGTransferSyntaxes,
+    )
 
     if not file.is_file():
         raise SourceNotFoundError("no such file", file=file)
     with _dicom_errors(file, None):
+        # pydicom would unpack the whole file to read its header: to whatever size it unpacks to. Its decoders
+        # find no pixels in one anyway.
+        if read_file_meta_info(file).get("TransferSyntaxUID") == DeflatedExplicitVRLittleEndian:
+            raise SourceError(
+                "a deflated file, which is not read; dcmconv +te of DCMTK, for one, writes it without",
+                file=file,
+                field="TransferSyntaxUID",
+            )
         header = dcmread(file, stop_before_pixels=True, specific_tags=list(_LOOKED_AT))
         syntax = header.file_meta.TransferSyntaxUID
     with _dicom_errors(file, None):

@@ -42,6 +42,7 @@ from data_catalog.readers.frames_folder import (
 from data_catalog.readers.stereo_footage import of_two_files
 from data_catalog.readers.video_header import Orientation, duration_of_pictures_s
 from data_catalog.stereo import pairs_by_name
+from extrags.array_files import MOST_PIXELS, TOO_MANY_PIXELS
 from extrags.config import IngestConfig
 from extrags.errors import SourceError, SourceNotFoundError
 
@@ -107,9 +108,11 @@ class VideoFile:
                 # Between joined recordings its duration may hold hours that nobody recorded.
                 self._announced = min(self._announced, file.stat().st_size // _ITS_PACKET_BYTES)
             aspect = float(stream.sample_aspect_ratio or 1)
+            _check_size(stream, self._file)
             first = next(_decoded(container, stream), None)
             self._orientation = Orientation() if first is None else Orientation.of_frame(first)
             stored = stream if first is None else first
+            _check_size(stored, self._file)
             self._size = int(stored.width), int(stored.height)
         self._pixel_aspect = aspect
         if self._orientation.swaps_axes:
@@ -370,6 +373,14 @@ def _opened(file: Path, named: Path) -> Iterator[tuple[Any, Any]]:
         stream = moving[0]
         stream.thread_type = "AUTO"
         yield container, stream
+
+
+def _check_size(pictures: Any, file: Path) -> None:
+    """Refuse a stream, or a frame of it, that would fill the memory: FFmpeg takes any size it can address."""
+    if pictures.width * pictures.height > MOST_PIXELS:
+        raise SourceError(
+            f"frames of {pictures.width} x {pictures.height} pixels, {TOO_MANY_PIXELS}", file=file
+        )
 
 
 def _is_cover(stream: Any) -> bool:

@@ -17,7 +17,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from jaxtyping import Float
 
-from extrags.array_files import load_npy
+from extrags.array_files import MOST_PIXELS, TOO_MANY_PIXELS, load_npy
 from extrags.errors import (
     ConfigError,
     NonFiniteError,
@@ -216,6 +216,8 @@ def _color(file: Path, shape: tuple[int, int]) -> Float[np.ndarray, "h w 3"]:
                     f"expected an 8-bit colour image, found the mode {stored}", file=file, field="mode"
                 )
             levels = np.asarray(image.convert("RGB"))
+    except Image.DecompressionBombError as error:
+        raise SourceError(TOO_MANY_PIXELS, file=file) from error
     except (UnidentifiedImageError, OSError, SyntaxError) as error:
         raise SourceError(f"this is no image that can be read: {reason_of(error)}", file=file) from error
     _check_size(file, levels.shape[:2], shape)
@@ -227,10 +229,12 @@ def _depth(file: Path, shape: tuple[int, int], step_mm: float | None) -> Float[n
 
     try:
         if file.suffix.lower() == ".npy":
-            values = load_npy(file)
+            values = load_npy(file, most=MOST_PIXELS)
         else:
             with Image.open(file) as image:
                 values = np.asarray(image)
+    except Image.DecompressionBombError as error:
+        raise SourceError(TOO_MANY_PIXELS, file=file) from error
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
         raise SourceError(f"this is no depth map that can be read: {reason_of(error)}", file=file) from error
     values = values[..., 0] if values.ndim == 3 and values.shape[-1] == 1 else values

@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
-__all__ = ["LONGEST_LABEL", "row_labels"]
+__all__ = ["LONGEST_LABEL", "drawable", "row_labels"]
 
 LONGEST_LABEL = 41
 SHORTEST_END = 12
+_NOT_DRAWN = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\ud800-\udfff\ufffe\uffff]")
+"""Control characters but for the line feed, and what is no character: no SVG holds them, no font has them."""
+
+
+def drawable(text: str) -> str:
+    r"""The text with `\x1b`, as Python writes it, in place of each character that no chart can hold.
+
+    Folders on disks of others can be named with any bytes.
+    """
+    return _NOT_DRAWN.sub(lambda found: found[0].encode("unicode_escape").decode("ascii"), text)
 
 
 def row_labels(names: Sequence[str]) -> list[str]:
@@ -19,9 +30,9 @@ def row_labels(names: Sequence[str]) -> list[str]:
     Args:
         names: of the rows.
     """
-    label_of = {name: _cut(name, LONGEST_LABEL) for name in names}
+    label_of = {name: _cut(_in_one_line(name), LONGEST_LABEL) for name in names}
     for alike in _coinciding(label_of):
-        label_of |= dict(zip(alike, _without_shared(alike), strict=True))
+        label_of |= dict(zip(alike, _without_shared([_in_one_line(name) for name in alike]), strict=True))
     for alike in _coinciding(label_of):
         taken = set(label_of.values())
         for name in alike[1:]:
@@ -31,6 +42,10 @@ def row_labels(names: Sequence[str]) -> list[str]:
             taken.add(label)
             label_of[name] = label
     return [label_of[name] for name in names]
+
+
+def _in_one_line(text: str) -> str:
+    return drawable(text).replace("\n", "\\n")
 
 
 def _cut(text: str, length: int) -> str:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from extrags.report.chart_labels import row_labels
+from extrags.report.chart_labels import drawable, row_labels
 from extrags.report.downloads import Cell, Chart, file_name
 from extrags.report.encode import data_uri
 
@@ -155,7 +155,10 @@ def svg_image(figure: Any) -> Chart:
     text, and whoever looks at the figure has it in a font of their own.
     """
     import matplotlib
+    from matplotlib.text import Text
 
+    for text in figure.findobj(Text):
+        text.set_text(drawable(text.get_text()))
     buffer = io.StringIO()
     with warnings.catch_warnings():
         as_text: Any = {"svg.fonttype": "none"} if _lacks_letters(figure) else {}

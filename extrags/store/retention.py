@@ -26,6 +26,12 @@ log = logging.getLogger(__name__)
 
 MOMENT_S = 600.0
 """What was made or used within it is kept: a run may have it in hand, and not have recorded it yet."""
+AHEAD_S = 86400.0
+"""By so much the clock of another machine that shares the store may be ahead. A time still later is that of a
+clock that was wrong, and has been set back: it would be kept until then."""
+
+_LAST_MOMENT = datetime.datetime.max.replace(microsecond=0, tzinfo=datetime.UTC).timestamp()
+"""File systems hold times beyond the last that has a date."""
 
 FINAL_STAGES = frozenset({"report", *PAGES_OF_SEVERAL})
 """Where a run has no record, its page stands for it, with what that was made from."""
@@ -197,7 +203,7 @@ def _planned(
         reached = contents.with_inputs(of_kept)
         reasons |= {key: "of no run that is kept" for key in contents.manifests if key not in reached}
     held = {key for run in going_on for key in run.keys}
-    held |= {key for key, used in contents.used.items() if used > now - MOMENT_S}
+    held |= {key for key, used in contents.used.items() if _is_in_hand(used, now)}
     held = contents.with_inputs(held)
     removed = _removable(reasons, held, contents, policy)
     if policy.max_bytes is not None:
@@ -236,7 +242,7 @@ def apply_policy(store: Store, policy: Policy) -> Cleaning:
         # A run may have begun to use it since; then it needs what that was made from.
         if item.key not in spared:
             used = store.backend.last_used([item.key]).get(item.key, 0.0)
-            if used > time.time() - MOMENT_S:
+            if _is_in_hand(used, time.time()):
                 spared |= contents.with_inputs([item.key])
                 continue
             try:
@@ -346,6 +352,10 @@ def _is_intermediate(key: str) -> bool:
     return stage_of(key) in INTERMEDIATE_STAGES
 
 
+def _is_in_hand(used: float, now: float) -> bool:
+    return now - MOMENT_S < used < now + AHEAD_S
+
+
 def _made(manifest: Manifest) -> float:
     started = _moment(manifest.started)
     return started + manifest.seconds if started else 0.0  # The first manifests had no date.
@@ -360,4 +370,5 @@ def _moment(text: str) -> float:
 
 
 def _date(moment: float) -> str:
+    moment = min(moment, _LAST_MOMENT)
     return datetime.datetime.fromtimestamp(moment, datetime.UTC).isoformat(timespec="seconds")

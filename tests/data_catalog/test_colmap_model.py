@@ -57,6 +57,13 @@ class TestRoundTrip:
         np.testing.assert_array_equal(back.points_rgb, varied.points_rgb)
         assert back.observed is not None
 
+    @pytest.mark.parametrize("name", ["a\nb", "a\rb"])
+    def test_a_name_of_two_lines_is_refused(self, clip, tmp_path, binary, name) -> None:
+        names = tuple(f"{name}{number}" for number in range(len(clip)))
+        with pytest.raises(SourceError, match=r"frame 0, field name: 'a\\[nr]b0' has a line break"):
+            write_colmap(replace(clip, frame_names=names), tmp_path / "scene", binary=binary)
+        assert not (tmp_path / "scene").exists()
+
     def test_decimals_have_their_place(self, clip, tmp_path, binary) -> None:
         names = tuple(f"t{number * 0.05:g}s" for number in range(len(clip)))
         write_colmap(replace(clip, frame_names=names), tmp_path / "scene", binary=binary)

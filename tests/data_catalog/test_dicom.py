@@ -165,6 +165,25 @@ class TestRefused:
         with pytest.raises(SourceError, match=rf"a\.dcm, {message}"):
             open_dicom(file)
 
+    @pytest.mark.parametrize(
+        ("side", "message"), [(65535, "pixels, too large: more than"), (9000, "in .* bytes: the")]
+    )
+    def test_frames_that_the_file_cannot_hold(self, scene, tmp_path, side, message) -> None:
+        file = write_dicom(tmp_path / "a.dcm", scene, Rows=side, Columns=side)
+        with pytest.raises(SourceError, match=rf"a\.dcm, field Rows: frames of {side} x .*{message}"):
+            open_dicom(file)
+
+    def test_what_unpacks_to_any_size(self, scene, tmp_path) -> None:
+        from pydicom import dcmread
+        from pydicom.uid import DeflatedExplicitVRLittleEndian
+
+        file = write_dicom(tmp_path / "a.dcm", scene)
+        dataset = dcmread(file)
+        dataset.file_meta.TransferSyntaxUID = DeflatedExplicitVRLittleEndian
+        dataset.save_as(file, enforce_file_format=True)
+        with pytest.raises(SourceError, match=r"a\.dcm, field TransferSyntaxUID: a deflated file"):
+            open_dicom(file)
+
     def test_no_dicom_file(self, tmp_path) -> None:
         file = tmp_path / "a.dcm"
         file.write_bytes(b"something else" * 30)

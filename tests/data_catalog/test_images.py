@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import zlib
 from pathlib import Path
 
 import cv2
@@ -272,3 +273,33 @@ class TestMasks:
 def test_spread_keeps_both_ends() -> None:
     assert spread(5, None) == [0, 1, 2, 3, 4]
     assert spread(100, 3) == [0, 50, 99]
+
+
+def write_png_header(file: Path, width: int, height: int, *, bits: int = 8) -> Path:
+    """An image of any size in a few bytes, as far as its header says."""
+    chunks = ((b"IHDR", struct.pack(">IIBBBBB", width, height, bits, 0, 0, 0, 0)), (b"IDAT", b""))
+    parts = [
+        struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+        for kind, body in chunks
+    ]
+    file.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(parts))
+    return file
+
+
+class TestTooLarge:
+    """What would fill the memory is not called damaged, and nothing of it is unpacked."""
+
+    def test_a_picture(self, tmp_path: Path) -> None:
+        file = write_png_header(tmp_path / "a.png", 100_000, 100_000)
+        for read in (read_color, read_mask, read_depth):
+            with pytest.raises(SourceError, match=r"a\.png.*: too large: more than the 178956970 pixels"):
+                read(file)
+
+    def test_an_array(self, tmp_path: Path) -> None:
+        file = tmp_path / "a.npy"
+        with file.open("wb") as stream:
+            header = {"descr": "<f4", "fortran_order": False, "shape": (100_000, 100_000)}
+            np.lib.format.write_array_header_1_0(stream, header)
+            stream.truncate(stream.tell() + 4 * 100_000**2)
+        with pytest.raises(SourceError, match=r"a\.npy.* 100000 x 100000 numbers, more than the 178956970"):
+            read_depth(file)

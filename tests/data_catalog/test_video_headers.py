@@ -133,3 +133,10 @@ class TestOrientation:
         for found, given in zip(decoded(tmp_path / "a.mp4"), decoded(plain), strict=True):
             np.testing.assert_array_equal(found, shown(given))
             assert video.size == (found.shape[1], found.shape[0])
+
+
+def test_frames_that_would_fill_the_memory(tmp_path: Path) -> None:
+    file = tmp_path / "a.y4m"
+    file.write_bytes(b"YUV4MPEG2 W16000 H16000 F25:1 Ip A1:1 C420\nFRAME\n" + bytes(1000))
+    with pytest.raises(SourceError, match=r"a\.y4m: frames of 16000 x 16000 pixels, too large: more than"):
+        VideoFile(file)

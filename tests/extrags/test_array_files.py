@@ -11,7 +11,7 @@ import pytest
 import torch
 from plyfile import PlyData, PlyElement
 
-from extrags.array_files import load_ply_vertices, load_safetensors, save_safetensors
+from extrags.array_files import load_npz, load_ply_vertices, load_safetensors, save_safetensors
 
 
 def test_tensors_of_any_layout_come_back(tmp_path: Path) -> None:
@@ -67,3 +67,15 @@ def test_vertices_are_not_read_number_by_number(tmp_path: Path) -> None:
     # Of its own: the file may change or go.
     assert found.flags.owndata
     assert np.array_equal(found["y"], rows["y"])
+
+
+def test_an_archive_that_would_fill_the_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "a.npz"
+    np.savez_compressed(file, a=np.zeros((1000, 1000)))
+    assert load_npz(file)["a"].shape == (1000, 1000)
+    monkeypatch.setattr("extrags.array_files._MOST_UNPACKED_BYTES", 1 << 20)
+    with pytest.raises(ValueError, match=r"\d+ bytes that unpack to 8000128: made to fill the memory"):
+        load_npz(file)
+    # Numbers that say something are never packed as densely.
+    np.savez_compressed(file, a=np.arange(1e6).reshape(1000, 1000))
+    assert load_npz(file)["a"][-1, -1] == 999_999

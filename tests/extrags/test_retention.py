@@ -84,6 +84,21 @@ class TestAge:
         ]
 
 
+class TestClockThatWasWrong:
+    def test_what_was_used_in_the_future_is_not_kept_until_then(self, store: Store) -> None:
+        put(store, "ingest", days=-400)
+        # The clock of another machine may be ahead by so much.
+        put(store, "other", days=-0.1)
+        assert planned(store, max_bytes=0) == ["ingest"]
+        assert names(apply_policy(store, Policy(max_bytes=0)).removed) == ["ingest"]
+
+    def test_times_beyond_the_calendar(self, store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+        put(store, "ingest")
+        monkeypatch.setattr(DirectoryBackend, "last_used", lambda *_: {"ingest-v1-00": 2.0**40})
+        assert usage(store)[0].used == "9999-12-31T23:59:59+00:00"
+        assert planned(store, older_than_s=0.0) == []
+
+
 class TestSize:
     @pytest.mark.parametrize(
         ("most", "gone"),

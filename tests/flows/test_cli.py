@@ -19,6 +19,7 @@ from extrags.errors import ConfigError, MissingDependencyError
 from flows.cli import VERBS, main, parser
 from flows.commands.common import parsed_settings, run_config
 from flows.outcome import SequenceOutcome
+from tests.data_catalog.test_images import write_png_header
 from tests.documented_json import undocumented
 from tests.flows.tiny import SEQUENCE, settled
 
@@ -97,6 +98,14 @@ class TestStart:
             said.stderr
             == "extrags: no home folder is known of this user; set HOME to a folder that can be written\n"
         )
+
+    def test_what_libraries_warn_of_is_not_said(self, tmp_path: Path) -> None:
+        """Pillow warns of images of more than 89 million pixels, once for each."""
+        for number in range(8):
+            write_png_header(tmp_path / f"{number}.png", 13_000, 13_000)
+        for option in ("", "-q"):
+            said = shell(f'data check "{tmp_path}" {option}', {"PYTHONWARNINGS": ""})
+            assert (said.returncode, said.stderr) == (1, "")
 
     @pytest.mark.parametrize("encoding", [pytest.param("latin-1", marks=pytest.mark.slow), "ascii"])
     def test_any_encoding_will_do(self, encoding: str, tmp_path: Path) -> None:

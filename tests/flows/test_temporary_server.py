@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 import sqlite3
 import subprocess
 from contextlib import closing
@@ -11,6 +12,7 @@ import httpx
 import pytest
 from prefect.exceptions import PrefectHTTPStatusError
 from prefect.settings import (
+    PREFECT_API_DATABASE_CONNECTION_URL,
     PREFECT_API_URL,
     PREFECT_HOME,
     PREFECT_SERVER_EPHEMERAL_ENABLED,
@@ -98,20 +100,98 @@ def test_a_server_that_fails_because_it_cannot_write_says_so(
         assert "cannot be written (No such file or directory)" in str(raised.value)
 
 
-def test_pages_of_other_sites_are_told_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    from prefect.settings import get_current_settings
+def test_a_database_as_large_as_a_file_may_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Others can still be written beside it: the limit alone tells why the server fails."""
+    (tmp_path / DATABASE).write_bytes(bytes(1000))
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (server_module.ROOM_BYTES + 1000, 1 << 30))
+    server_module._check_room(tmp_path)
+    (tmp_path / f"{DATABASE}-wal").write_bytes(bytes(2000))
+    with pytest.raises(ServerError, match=r"\(File too large: no more than 1049576 bytes .* ulimit -f\)"):
+        server_module._check_room(tmp_path)
 
-    given: dict[str, str] = {}
+
+def test_a_server_that_has_no_room_from_the_beginning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It would end with a traceback, and its code says nothing."""
+    monkeypatch.delenv("PREFECT_API_URL", raising=False)
+    monkeypatch.setenv("PREFECT_HOME", str(tmp_path))
+    monkeypatch.setattr(server_module, "_started", {})
+    monkeypatch.setattr(server_module, "_launch", lambda settings: pytest.fail("it was started"))
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (1000, 1000))
+    server_module.start_early()
+    settings = {
+        PREFECT_API_URL: None,
+        PREFECT_SERVER_EPHEMERAL_ENABLED: True,
+        PREFECT_HOME: tmp_path,
+        PREFECT_API_DATABASE_CONNECTION_URL: f"sqlite+aiosqlite:///{tmp_path / DATABASE}",
+    }
+    with (
+        temporary_settings(settings),
+        pytest.raises(ServerError, match="cannot be written"),
+        temporary_server(),
+    ):
+        pytest.fail("there is no server")
+
+
+def test_a_server_that_ends_at_once_for_want_of_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    server = subprocess.Popen(["false"])
+    server.wait()
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (1000, 1000))
+    settings = {
+        PREFECT_HOME: tmp_path,
+        PREFECT_API_DATABASE_CONNECTION_URL: f"sqlite+aiosqlite:///{tmp_path / DATABASE}",
+    }
+    with temporary_settings(settings), pytest.raises(ServerError, match="cannot be written"):
+        server_module._wait(server, "http://127.0.0.1:9/api", 5)
+    with (
+        temporary_settings({**settings, PREFECT_HOME: tmp_path / "another"}),
+        pytest.raises(ServerError, match="ended at once with code 1"),
+    ):
+        server_module._wait(server, "http://127.0.0.1:9/api", 5)
+
+
+@pytest.fixture
+def given(monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
+    """The environment of a server that is launched, but not started."""
+    found: dict[str, str] = {}
 
     class Process:
         def __init__(self, command: list[str], *, env: dict[str, str], **_: object) -> None:
-            given.update(env)
+            found.update(env)
 
     monkeypatch.setattr(subprocess, "Popen", Process)
     monkeypatch.setattr(server_module.atexit, "register", lambda *_: None)
+    return found
+
+
+def test_pages_of_other_sites_are_told_nothing(
+    given: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from prefect.settings import get_current_settings
+
     # As somebody's own server is told to.
     address, _ = server_module._launch({"PREFECT_SERVER_CORS_ALLOWED_ORIGINS": "*"})
     for name in server_module.CORS_VARIABLES:
         monkeypatch.setenv(name, given[name])
     allowed = type(get_current_settings())().server.api.cors_allowed_origins
     assert allowed == address.removesuffix("/api")
+
+
+@pytest.mark.parametrize("support", ["true", "false"])
+def test_pages_of_other_sites_change_nothing(
+    given: dict[str, str], monkeypatch: pytest.MonkeyPatch, support: str
+) -> None:
+    """Where clients ask for no token, the server cannot ask for one."""
+    from prefect.settings import get_current_settings
+
+    for name in (server_module.TOKEN_VARIABLE, server_module.TOKEN_OF_CLIENTS):
+        monkeypatch.delenv(name, raising=False)
+    assert get_current_settings().client.csrf_support_enabled
+    server_module._launch({} if support == "true" else {server_module.TOKEN_OF_CLIENTS: support})
+    for name in {server_module.TOKEN_VARIABLE, server_module.TOKEN_OF_CLIENTS} & given.keys():
+        monkeypatch.setenv(name, given[name])
+    found = type(get_current_settings())()
+    assert (
+        found.server.api.csrf_protection_enabled == found.client.csrf_support_enabled == (support == "true")
+    )

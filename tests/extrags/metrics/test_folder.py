@@ -15,6 +15,7 @@ from extrags.errors import ConfigError, NonFiniteError, ShapeError, SourceError,
 from extrags.metrics.folder import _color, read_renders
 from extrags.metrics.protocol import RenderedViews, evaluate_views
 from extrags.sequence import EndoscopicSequence, Split
+from tests.data_catalog.test_images import write_png_header
 
 FRAMES, HEIGHT, WIDTH = 5, 24, 32
 TEST = np.array([3, 1, 4])
@@ -286,3 +287,9 @@ class TestRefused:
         np.save(depth / "0.npy", np.ones((3, HEIGHT, WIDTH), dtype=np.float32))
         with pytest.raises(ShapeError, match="expected two dimensions"):
             read_renders(folder, sequence, depth_folder=depth)
+
+    def test_larger_than_the_memory(self, sequence: EndoscopicSequence, tmp_path: Path) -> None:
+        folder = write(tmp_path / "r", {f"b_{index:04d}.png": LEVELS[index] for index in TEST})
+        write_png_header(folder / "b_0003.png", 100_000, 100_000)
+        with pytest.raises(SourceError, match=r"b_0003\.png: too large: more than the 178956970 pixels"):
+            read_renders(folder, sequence)

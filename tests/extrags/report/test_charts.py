@@ -4,6 +4,7 @@ import base64
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -155,7 +156,21 @@ def test_names_may_be_long_and_have_any_letters() -> None:
     assert [line.split(",")[0] for line in numbers(chart)] == ["a" * 150, "cost$_$x", "b_{$"]
 
 
+@pytest.mark.parametrize("letter", ["\x1b", "\x07", "\x00", "\x9b", "\uffff"])
+def test_letters_that_no_svg_may_hold(letter: str) -> None:
+    """A chart with one of them in it is no XML, and no browser shows it."""
+    drawn = {f"3dgs{letter}": {f"a{letter}b": [20.0]}}
+    chart = methods_chart([f"a{letter}b"], drawn, drawn, {f"3dgs{letter}": FINAL_COLOR}, f"PSNR{letter}")
+    ElementTree.fromstring(base64.b64decode(chart.uri.partition("base64,")[2]))
+
+
 class TestLabelsOfRows:
+    def test_each_in_one_line(self) -> None:
+        assert row_labels(["a\nb", "a\x1b[2J"]) == ["a\\nb", "a\\x1b[2J"]
+        alike = row_labels([f"\n{'x' * 60}{number}\n" for number in range(2)])
+        assert len(set(alike)) == 2
+        assert "\n" not in "".join(alike)
+
     def test_what_runs_differ_in_is_kept(self) -> None:
         names = [f"phantom/11@sparse, seed {seed} [coarse.iterations=150]" for seed in (0, 1)]
         assert row_labels(names) == [
