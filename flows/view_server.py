@@ -13,6 +13,7 @@ import socket
 import tempfile
 import threading
 import time
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from http import HTTPStatus
@@ -83,6 +84,8 @@ class ViewServer:
     ) -> None:
         viser = check_installed()
         _check_address(host, port)
+        # A page may leave while a picture is made for it.
+        warnings.filterwarnings("ignore", r"Queued a \w+ on a closed connection", UserWarning)
         self._renderer, self._width = renderer, width
         self._start = overview(renderer.scene, width) if renderer.train is None else renderer.train[0]
         self._viewers: dict[int, _Viewer] = {}

@@ -464,7 +464,10 @@ def test_pages_of_other_sites_are_refused(caplog: pytest.LogCaptureFixture) -> N
 
 @pytest.mark.skipif(not REAL, reason="viser is not installed: pip install -e '.[view]'")
 def test_a_real_server_answers_a_real_browser(
-    renderer: SceneRenderer, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
+    renderer: SceneRenderer,
+    caplog: pytest.LogCaptureFixture,
+    capsys: pytest.CaptureFixture[str],
+    recwarn: pytest.WarningsRecorder,
 ) -> None:
     import cv2
     import msgspec.msgpack
@@ -508,12 +511,18 @@ def test_a_real_server_answers_a_real_browser(
             # Nobody can have the scene shown to the world.
             browser.send(msgspec.msgpack.encode({"type": "ShareUrlRequest"}))
             look(0.0)
+            (viewer,) = eventually(lambda: list(server._viewers.values()))
             shown = pictures()
             assert next(picture for picture in shown if picture.shape == (80, 160, 3)).mean() > 10
             look(0.4)
             assert next(shown).shape == (40, 80, 3), "half while it moves"
             assert next(picture for picture in shown if picture.shape == (80, 160, 3)).mean() > 10
         assert "a page asked for a public address" in eventually(lambda: caplog.text)
+        # It has left while a picture is made for it.
+        eventually(lambda: not server._viewers)
+        viewer._client.scene.set_background_image(np.zeros((4, 4, 3), np.uint8))
     finally:
         server.stop()
-    assert capsys.readouterr().out == ""
+    told = capsys.readouterr()
+    assert (told.out, told.err) == ("", "")
+    assert [str(warning.message) for warning in recwarn] == []
