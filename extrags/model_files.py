@@ -7,7 +7,7 @@ import json
 from collections.abc import Mapping
 from pathlib import Path
 
-__all__ = ["files_fingerprint", "fingerprint", "missing_weights"]
+__all__ = ["files_fingerprint", "fingerprint", "lacking_weights"]
 
 EDGE_BYTES = 1 << 20
 """Bytes read at both ends of each file: large weight files hardly change in the middle alone."""
@@ -46,20 +46,40 @@ def files_fingerprint(files: Mapping[str, Path]) -> str:
     return digest.hexdigest()
 
 
-def missing_weights(folder: Path, name: str) -> str | None:
-    """The first file of a model's weights that is missing; None when all are there.
+def lacking_weights(folder: Path, name: str) -> str | None:
+    """What a model's weights lack, "FILE is missing" for instance; None when all are there and whole.
 
     Args:
         folder: that should hold them.
         name: of the file; without it `NAME.index.json` lists the files it was cut into.
     """
-    if (folder / name).is_file():
-        return None
-    shards = folder / f"{name}.index.json"
-    if not shards.is_file():
-        return name
-    try:
-        names = sorted(set(json.loads(shards.read_text())["weight_map"].values()))
-    except (ValueError, KeyError, TypeError, AttributeError):
-        return shards.name
-    return next((shard for shard in names if not (folder / shard).is_file()), None)
+    names = [name]
+    if not (folder / name).is_file():
+        shards = folder / f"{name}.index.json"
+        if not shards.is_file():
+            return f"{name} is missing"
+        try:
+            names = sorted(set(json.loads(shards.read_text())["weight_map"].values()))
+        except (ValueError, KeyError, TypeError, AttributeError):
+            return f"{shards.name} is damaged"
+    for each in names:
+        if not (folder / each).is_file():
+            return f"{each} is missing"
+        if not _is_whole(folder / each):
+            return f"{each} is cut short or no safetensors file"
+    return None
+
+
+def _is_whole(file: Path) -> bool:
+    """Whether a safetensors file is as long as its header says; its tensors are not read."""
+    size = file.stat().st_size
+    with file.open("rb") as stream:
+        length = int.from_bytes(stream.read(8), "little")
+        if size < 8 or length > size - 8:
+            return False
+        try:
+            header = json.loads(stream.read(length))
+            ends = [entry["data_offsets"][1] for name, entry in header.items() if name != "__metadata__"]
+            return size == 8 + length + max(ends, default=0)
+        except (ValueError, KeyError, TypeError, AttributeError, IndexError, RecursionError):
+            return False

@@ -6,11 +6,14 @@ viser's page steers the camera and has the controls; what it shows is rendered h
 from __future__ import annotations
 
 import contextlib
+import errno
 import io
 import logging
+import socket
 import tempfile
 import threading
 import time
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from http import HTTPStatus
@@ -33,6 +36,7 @@ logger = logging.getLogger(__name__)
 
 _QUALITY_MOVING, _QUALITY_STILL = 75, 92
 """Of JPEG, in per cent."""
+_LEAST_WIDTH_PX = 16
 _SAY_EVERY_S = 0.25
 _KEYS_PER_DEPTH = 2.0
 """The page's keys move the camera by two of its units in a second: one typical depth of the scene."""
@@ -61,9 +65,10 @@ class ViewServer:
         title: of the page.
         host: address to listen at; 127.0.0.1 is this machine alone. Nobody is asked for a password.
         port: to listen at; 0 takes a free one.
-        width: of a picture at full resolution, in pixels.
+        width: of a picture at full resolution, in pixels; of a picture that is taller than wide, its height.
 
     Raises:
+        ConfigError: when this machine cannot listen at the address.
         MissingDependencyError: without viser.
         StoreError: when the port is taken.
     """
@@ -78,6 +83,9 @@ class ViewServer:
         width: int = 640,
     ) -> None:
         viser = check_installed()
+        _check_address(host, port)
+        # A page may leave while a picture is made for it.
+        warnings.filterwarnings("ignore", r"Queued a \w+ on a closed connection", UserWarning)
         self._renderer, self._width = renderer, width
         self._start = overview(renderer.scene, width) if renderer.train is None else renderer.train[0]
         self._viewers: dict[int, _Viewer] = {}
@@ -90,10 +98,10 @@ class ViewServer:
         self._server.gui.configure_theme(show_share_button=False)
         found = int(self._server.get_port())
         if port not in (0, found):
-            # viser goes on to the next port that is free, where nobody looks for it.
+            # Taken since it was tried: viser goes on to the next that is free, where nobody looks for it.
             self._stop()
-            raise StoreError(f"port {port} of {host} is taken; choose another one with --port")
-        self.url = f"http://{host}:{found}"
+            raise _taken(host, port)
+        self.url = f"http://{_named(host)}:{found}"
         self._server.on_client_connect(self._connected)
         self._server.on_client_disconnect(self._gone)
 
@@ -123,6 +131,47 @@ class ViewServer:
     def _stop(self) -> None:
         with _silent():
             self._server.stop()
+
+
+def _check_address(host: str, port: int) -> None:
+    """Listen where viser will: it takes every refusal for a taken port, and after a thousand waits for ever.
+
+    Raises:
+        ConfigError: when this machine cannot listen there.
+        StoreError: when the port is taken.
+    """
+    if not host:
+        raise ConfigError("no host is named; 0.0.0.0 listens at every address of this machine")
+    try:
+        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+    except (socket.gaierror, UnicodeError) as error:
+        raise ConfigError(f"the host {host} is not found: {getattr(error, 'strerror', error)}") from error
+    for family, kind, protocol, _, address in found:
+        with socket.socket(family, kind, protocol) as trial:
+            trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            if family == socket.AF_INET6:
+                trial.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+            try:
+                trial.bind(address)
+            except OSError as error:
+                if error.errno == errno.EADDRINUSE:
+                    raise _taken(host, port) from error
+                raise ConfigError(f"cannot listen at port {port} of {host}: {error.strerror}") from error
+
+
+def _taken(host: str, port: int) -> StoreError:
+    return StoreError(f"port {port} of {host} is taken; choose another one with --port")
+
+
+def _named(host: str) -> str:
+    """The host as an address in a browser on this machine names it."""
+    try:
+        address = ip_address(host)
+    except ValueError:
+        return host
+    if address.is_unspecified:
+        return "localhost"
+    return f"[{host}]" if address.version == 6 else host
 
 
 @contextlib.contextmanager
@@ -200,7 +249,7 @@ class _Viewer:
         # Scenes are in any unit; the page's keys, wheel and limits are made for a few units.
         self._unit = typical_depth(renderer.scene, start) / _KEYS_PER_DEPTH
         self.session = ViewSession(renderer, start, width=width)
-        self._start = start
+        self._start, self._width = start, width
         self._said_at = -np.inf
         self._moving = self._still = ""
         self._controls()
@@ -228,8 +277,13 @@ class _Viewer:
         pose = np.eye(4)
         pose[:3, :3] = Rotation.from_quat(np.asarray(page.wxyz)[[1, 2, 3, 0]]).as_matrix()
         pose[:3, 3] = np.asarray(page.position) * self._unit
+        aspect = float(page.aspect)
+        # A narrow window would have pictures of far more pixels than it shows.
+        width = max(_LEAST_WIDTH_PX, round(self._width * aspect)) if 0 < aspect < 1 else self._width
         try:
-            self.session.look(pinhole(pose, float(page.fov), float(page.aspect), self.session.camera.width))
+            camera = pinhole(pose, float(page.fov), aspect, width)
+            self.session.resize(width)
+            self.session.look(camera)
         except ExtragsError as error:
             # E.g. a window without height, or an hour of recording, which ends it.
             self._say(str(error))
@@ -268,7 +322,7 @@ class _Viewer:
 
     def _tell(self) -> None:
         count, seconds = self.session.recorded
-        path = f"path: {count} views, {seconds:.1f} s"
+        path = f"path: {count} {'view' if count == 1 else 'views'}, {seconds:.1f} s"
         self._status.content = "  \n".join(line for line in (self._moving, self._still, path) if line)
 
     def _say(self, message: str) -> None:
@@ -296,13 +350,19 @@ class _Viewer:
             width = gui.add_slider(
                 "width (px)", min=160, max=1920, step=32, initial_value=self._width_shown()
             )
-            self._on_value(width, lambda pixels: session.resize(int(pixels)))
+            self._on_value(width, lambda pixels: self._resize(int(pixels)))
         with gui.add_folder("Camera"):
-            train = session.renderer.train
+            train, frame = session.renderer.train, None
             if train is not None and len(train) > 1:
                 frame = gui.add_slider("training view", min=0, max=len(train) - 1, step=1, initial_value=0)
                 self._on_value(frame, lambda index: self._place(train[int(index)]))
-            self._on_click(gui.add_button("back to the start"), lambda: self._place(self._start))
+
+            def go_back() -> None:
+                if frame is not None:
+                    frame.value = 0
+                self._place(self._start)
+
+            self._on_click(gui.add_button("back to the start"), go_back)
         with gui.add_folder("Path"):
             self._record = gui.add_checkbox("record", initial_value=False)
             self._on_value(self._record, session.record)
@@ -317,13 +377,28 @@ class _Viewer:
             self._on_click(gui.add_button("clear"), clear)
 
     def _width_shown(self) -> int:
-        return int(np.clip(self.session.camera.width, 160, 1920))
+        return int(np.clip(self._width, 160, 1920))
+
+    def _resize(self, width: int) -> None:
+        self._width = width
+        self._look(self._client.camera)
 
     def _change(self, **changed: Any) -> None:
         self.session.change(replace(self.session.settings, **changed))
 
     def _on_value(self, control: Any, do: Any) -> None:
-        control.on_update(lambda _: self._guarded(do, control.value))
+        def changed(_: Any) -> None:
+            value = control.value
+            if hasattr(control, "min"):
+                # What is typed beside a slider is held to its ends only when it is left.
+                value = min(max(value, control.min), control.max)
+                if value != control.value:
+                    # This calls again.
+                    control.value = value
+                    return
+            self._guarded(do, value)
+
+        control.on_update(changed)
 
     def _on_click(self, button: Any, do: Any) -> None:
         button.on_click(lambda _: self._guarded(do))
@@ -331,8 +406,12 @@ class _Viewer:
     def _guarded(self, do: Any, *values: Any) -> None:
         try:
             do(*values)
-        except ConfigError as error:
+        except ExtragsError as error:
             self._say(str(error))
+        except Exception as error:
+            # Viser would print it, and the page say nothing.
+            logger.exception("a control of the page failed")
+            self._say(f"{type(error).__name__}: {error}")
         self._tell()
 
     def _save(self, fps: float) -> None:

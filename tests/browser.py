@@ -32,7 +32,7 @@ class Browser:
     def __init__(self, address: str) -> None:
         from websockets.sync.client import connect
 
-        self._socket = connect(address, max_size=None)
+        self._socket = connect(address, max_size=None, ping_interval=None)
         self._sent = 0
         self.errors: list[str] = []
         self.requests: list[str] = []

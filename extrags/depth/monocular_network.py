@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from extrags.errors import MissingDependencyError, WeightsError, installed_with, reason_of
-from extrags.model_files import fingerprint, missing_weights
+from extrags.model_files import fingerprint, lacking_weights
 from extrags.user_paths import expanded
 
 __all__ = ["MonocularNetwork", "Preparation", "find_monocular", "load_monocular", "monocular_digest"]
@@ -157,10 +157,10 @@ def find_monocular(setting: str) -> Path:
     for name in (CONFIG, PREPROCESSOR):
         if not (folder / name).is_file():
             raise WeightsError(f"{said}: {folder} holds no {name}")
-    missing = missing_weights(folder, WEIGHTS)
-    if missing is not None:
+    lacking = lacking_weights(folder, WEIGHTS)
+    if lacking is not None:
         raise WeightsError(
-            f"{said}: {folder} is not whole, {missing} is missing (weights are read from .safetensors alone)"
+            f"{said}: {folder} is not whole, {lacking} (weights are read from .safetensors alone)"
         )
     named = _json(folder / CONFIG).get("architectures") or ["no architecture"]
     if named[0] not in ARCHITECTURES:

@@ -55,7 +55,8 @@ def add_arguments(parser: Parser) -> None:
         type=int,
         default=640,
         metavar="PX",
-        help="width of a picture at full resolution (default: %(default)s); the window gives its height",
+        help="width of a picture at full resolution, or its height in a window that is taller than wide "
+        "(default: %(default)s); the window gives its shape",
     )
     parser.add_argument(
         "--port", type=int, default=8080, metavar="N", help="0 takes a free one (default: %(default)s)"
@@ -73,7 +74,8 @@ def view(given: argparse.Namespace) -> int:
     """`extrags view`; serves until it is interrupted.
 
     Raises:
-        ConfigError: for an option that makes no sense, or a method without Gaussians.
+        ConfigError: for an option that makes no sense, an address that is not of this machine, or a method
+            without Gaussians.
         MissingDependencyError: without viser.
         SourceError: when the file is damaged.
         StoreError: when the run is not in the store, or the port is taken.
@@ -91,7 +93,7 @@ def view(given: argparse.Namespace) -> int:
 
     renderer = SceneRenderer(shown.scene, train=shown.train, masks=shown.masks, device=device)
     server = ViewServer(
-        renderer, title=f"extrags: {shown.name}", host=given.host, port=given.port, width=given.width
+        renderer, title=f"{shown.name} (extrags)", host=given.host, port=given.port, width=given.width
     )
     where = "gsplat on CUDA" if device == "cuda" else f"native kernels ({native_isa()})"
     print(
@@ -169,4 +171,4 @@ def _from_store(given: argparse.Namespace) -> _Shown:
     train = frames.training_cameras
     pinholes = train.as_pinholes()
     masks = list(shown_pixels(frames.training_masks, train, pinholes))
-    return _Shown(f"{which} scene of {given.sequence}", scene, pinholes, masks)
+    return _Shown(f"{given.sequence}, {which} scene", scene, pinholes, masks)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import importlib.util
 import json
+import socket
 import sys
 import threading
 import time
@@ -19,7 +20,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from extrags.cameras import Cameras
-from extrags.errors import MissingDependencyError, StoreError
+from extrags.errors import ConfigError, MissingDependencyError, StoreError
 from extrags.export import read_camera_path
 from extrags.scene import Scene
 from extrags.splat_files import write_ply_scene
@@ -52,6 +53,8 @@ def stand_in(monkeypatch: pytest.MonkeyPatch) -> type[viser_stand_in.ViserServer
     module.ViserServer = viser_stand_in.ViserServer  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "viser", module)
     monkeypatch.setattr(viser_stand_in.ViserServer, "made", [])
+    # It listens nowhere, so that no program is in its way.
+    monkeypatch.setattr(view_server, "_check_address", lambda *_: None)
     return viser_stand_in.ViserServer
 
 
@@ -138,6 +141,48 @@ class TestRefused:
         assert stand_in.made[0].stopped
 
 
+class TestAddress:
+    """Where viser could not listen, it would try a thousand ports and wait for ever."""
+
+    @pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0"])
+    def test_a_port_that_is_taken(self, host: str) -> None:
+        with socket.create_server(("127.0.0.1", 0)) as other:
+            port = other.getsockname()[1]
+            with pytest.raises(StoreError, match=f"port {port} of {host} is taken"):
+                view_server._check_address(host, port)
+        view_server._check_address(host, port)
+
+    @pytest.mark.parametrize(
+        ("host", "message"),
+        [
+            ("", "no host is named"),
+            ("station.invalid", "the host station.invalid is not found"),
+            ("a" * 70, "is not found"),
+            # Of addresses for documentation, which no machine has.
+            ("203.0.113.7", r"cannot listen at port 0 of 203\.0\.113\.7"),
+        ],
+    )
+    def test_no_address_of_this_machine(self, host: str, message: str) -> None:
+        with pytest.raises(ConfigError, match=message):
+            view_server._check_address(host, 0)
+
+    @pytest.mark.parametrize(
+        ("host", "url"),
+        [
+            ("127.0.0.1", "http://127.0.0.1:8080"),
+            ("station.lab", "http://station.lab:8080"),
+            ("0.0.0.0", "http://localhost:8080"),
+            ("::", "http://localhost:8080"),
+            ("::1", "http://[::1]:8080"),
+        ],
+    )
+    @pytest.mark.usefixtures("stand_in")
+    def test_it_is_told_as_a_browser_takes_it(self, renderer: SceneRenderer, host: str, url: str) -> None:
+        server = ViewServer(renderer, host=host)
+        assert server.url == url
+        server.stop()
+
+
 class TestServed:
     """The command, up to the point where it waits for its end."""
 
@@ -167,6 +212,7 @@ class TestServed:
         (server,) = stand_in.made
         assert (server.host, server.port, server.stopped) == ("127.0.0.1", 8080, True)
         assert "http://127.0.0.1:8080: tube.ply, 4" in capsys.readouterr().out
+        assert server.label == "tube.ply (extrags)"
         torch.testing.assert_close(shown[0].gaussians.means, scene.gaussians.means)
         assert shown[0].light is not None, "a PLY of ours keeps it"
 
@@ -245,7 +291,48 @@ class TestBrowser:
         np.testing.assert_allclose(client.camera.position * 10.0, tube_cameras(6).centers[3])
         controls["back to the start"].set()
         np.testing.assert_allclose(client.camera.position * 10.0, tube_cameras(6).centers[0])
+        assert controls["training view"].value == 0
         assert client.told == []
+
+    def test_what_no_slider_reaches_is_its_end(self, client: viser_stand_in.Client) -> None:
+        """The number beside a slider takes any until it is left."""
+        controls = client.gui.controls
+        eventually(lambda: client.pictures)
+        controls["training view"].set(999)
+        assert controls["training view"].value == 5
+        np.testing.assert_allclose(client.camera.position * 10.0, tube_cameras(6).centers[5])
+        controls["exposure (stops)"].set(2000.0)
+        assert controls["exposure (stops)"].value == 5.0
+        controls["width (px)"].set(-7)
+        eventually(lambda: client.pictures[-1].shape[1] == 160)
+        assert client.told == []
+
+    def test_a_narrow_window_has_no_larger_pictures(self, client: viser_stand_in.Client) -> None:
+        eventually(lambda: client.pictures)
+        client.camera.move(aspect=0.5)
+        eventually(lambda: client.pictures[-1].shape == (160, 80, 3))
+        client.gui.controls["width (px)"].set(320)
+        eventually(lambda: client.pictures[-1].shape == (320, 160, 3))
+        client.camera.move(aspect=0.01)
+        eventually(lambda: client.pictures[-1].shape[1] == 16)
+        client.camera.move(aspect=2.0)
+        eventually(lambda: client.pictures[-1].shape == (160, 320, 3))
+
+    def test_a_control_that_fails_says_so(
+        self,
+        client: viser_stand_in.Client,
+        monkeypatch: pytest.MonkeyPatch,
+        caplog: pytest.LogCaptureFixture,
+    ) -> None:
+        def fails(*_: Any) -> None:
+            raise OSError("no space left")
+
+        client.gui.controls["add view"].set()
+        assert "path: 1 view," in client.gui.controls["status"].content
+        monkeypatch.setattr(view_server, "write_camera_path", fails)
+        client.gui.controls["save"].set()
+        assert client.told == ["OSError: no space left"]
+        assert "a control of the page failed" in caplog.text
 
     def test_a_path_is_saved(self, client: viser_stand_in.Client, tmp_path: Path) -> None:
         controls = client.gui.controls
@@ -377,7 +464,10 @@ def test_pages_of_other_sites_are_refused(caplog: pytest.LogCaptureFixture) -> N
 
 @pytest.mark.skipif(not REAL, reason="viser is not installed: pip install -e '.[view]'")
 def test_a_real_server_answers_a_real_browser(
-    renderer: SceneRenderer, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
+    renderer: SceneRenderer,
+    caplog: pytest.LogCaptureFixture,
+    capsys: pytest.CaptureFixture[str],
+    recwarn: pytest.WarningsRecorder,
 ) -> None:
     import cv2
     import msgspec.msgpack
@@ -421,12 +511,18 @@ def test_a_real_server_answers_a_real_browser(
             # Nobody can have the scene shown to the world.
             browser.send(msgspec.msgpack.encode({"type": "ShareUrlRequest"}))
             look(0.0)
+            (viewer,) = eventually(lambda: list(server._viewers.values()))
             shown = pictures()
             assert next(picture for picture in shown if picture.shape == (80, 160, 3)).mean() > 10
             look(0.4)
             assert next(shown).shape == (40, 80, 3), "half while it moves"
             assert next(picture for picture in shown if picture.shape == (80, 160, 3)).mean() > 10
         assert "a page asked for a public address" in eventually(lambda: caplog.text)
+        # It has left while a picture is made for it.
+        eventually(lambda: not server._viewers)
+        viewer._client.scene.set_background_image(np.zeros((4, 4, 3), np.uint8))
     finally:
         server.stop()
-    assert capsys.readouterr().out == ""
+    told = capsys.readouterr()
+    assert (told.out, told.err) == ("", "")
+    assert [str(warning.message) for warning in recwarn] == []

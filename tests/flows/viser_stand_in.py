@@ -11,12 +11,21 @@ import numpy as np
 
 
 class Control:
-    """A slider, checkbox, dropdown, button or text."""
+    """A slider, checkbox, dropdown, button or text; a value that is assigned calls as viser's does."""
 
     def __init__(self, value: Any = None) -> None:
-        self.value = value
+        self._value = value
         self.content = value
         self.called: list[Callable[[Any], None]] = []
+
+    @property
+    def value(self) -> Any:
+        return self._value
+
+    @value.setter
+    def value(self, value: Any) -> None:
+        if value != self._value:
+            self.set(value)
 
     def on_update(self, call: Callable[[Any], None]) -> None:
         self.called.append(call)
@@ -24,8 +33,8 @@ class Control:
     on_click = on_update
 
     def set(self, value: Any = True) -> None:
-        """What a person does to it."""
-        self.value = value
+        """What a person does to it, who can type what no slider reaches."""
+        self._value = value
         for call in self.called:
             call(SimpleNamespace(target=self))
 
@@ -48,7 +57,9 @@ class Gui:
 
     def add_slider(self, label: str, *, min: float, max: float, step: float, initial_value: float) -> Control:
         assert min <= initial_value <= max
-        return self._add(label, min=min, max=max, step=step, initial_value=initial_value)
+        slider = self._add(label, min=min, max=max, step=step, initial_value=initial_value)
+        slider.min, slider.max = min, max  # type: ignore[attr-defined]
+        return slider
 
     def add_checkbox(self, label: str, *, initial_value: bool) -> Control:
         return self._add(label, initial_value=initial_value)

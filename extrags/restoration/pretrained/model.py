@@ -18,7 +18,7 @@ import torch
 from extrags.config import PretrainedConfig
 from extrags.devices import chosen_device
 from extrags.errors import ConfigError, MissingDependencyError, WeightsError, installed_with, reason_of
-from extrags.restoration.pretrained.parts import missing_part
+from extrags.restoration.pretrained.parts import lacking_part
 from extrags.user_paths import expanded
 
 __all__ = [
@@ -134,10 +134,10 @@ def find_model(rule: PipelineRule, settings: PretrainedConfig) -> Path:
         raise WeightsError(
             f"{index} names a {found}; enhance.backend={rule.backend} needs one of {', '.join(rule.accepts)}"
         )
-    missing = missing_part(folder, description, (*rule.text_parts, *rule.image_parts), rule.absent)
-    if missing is not None:
+    lacking = lacking_part(folder, description, (*rule.text_parts, *rule.image_parts), rule.absent)
+    if lacking is not None:
         raise WeightsError(
-            f"{folder} is not whole, {missing} is missing (weights are read from .safetensors alone). Was "
+            f"{folder} is not whole, {lacking} (weights are read from .safetensors alone). Was "
             f"its download interrupted? {_how_to_get(model, rule)}"
         )
     return folder

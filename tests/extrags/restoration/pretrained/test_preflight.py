@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import subprocess
 from collections.abc import Callable
@@ -88,11 +89,36 @@ class TestPipelines:
         index.write_text(json.dumps({"weight_map": dict(zip("ab", shards, strict=True))}))
         with pytest.raises(WeightsError, match=f"transformer/{shards[1]} is missing"):
             check_restorer(pretrained("wan-vace", folder))
-        whole.with_name(shards[1]).write_bytes(b"more")
+        shutil.copy(whole.with_name(shards[0]), whole.with_name(shards[1]))
         check_restorer(pretrained("wan-vace", folder))
-        index.write_text("{}")
-        with pytest.raises(WeightsError, match=r"safetensors\.index\.json is missing"):
+        os.truncate(whole.with_name(shards[1]), 2000)
+        with pytest.raises(WeightsError, match=f"transformer/{shards[1]} is cut short"):
             check_restorer(pretrained("wan-vace", folder))
+        index.write_text("{}")
+        with pytest.raises(WeightsError, match=r"safetensors\.index\.json is damaged"):
+            check_restorer(pretrained("wan-vace", folder))
+
+    @pytest.mark.parametrize(
+        "content",
+        [
+            b"",
+            b"1234567",
+            b"version https://git-lfs.github.com/spec/v1\n",
+            bytes(8),
+            b"\2" + bytes(7) + b"[]",
+        ],
+        ids=["empty", "seven-bytes", "git-lfs", "no-header", "no-mapping"],
+    )
+    def test_what_is_no_file_of_weights(
+        self, content: bytes, saved: Callable[[str], Path], tmp_path: Path
+    ) -> None:
+        folder = tmp_path / "other"
+        shutil.copytree(saved("StableDiffusionImg2ImgPipeline"), folder)
+        (folder / "vae" / "diffusion_pytorch_model.safetensors").write_bytes(content)
+        with pytest.raises(
+            WeightsError, match=r"vae/diffusion_pytorch_model\.safetensors is cut short or no"
+        ):
+            check_restorer(pretrained("sd-img2img", folder))
 
     def test_settings_that_do_not_fit_are_told_before_the_model_is_looked_for(self, tmp_path: Path) -> None:
         settings = PretrainedConfig(model=str(tmp_path / "none"), frames=16)
