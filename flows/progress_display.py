@@ -100,8 +100,8 @@ def progress_display(showing: Showing, run: RunInView | None = None) -> Iterator
 def _live(display: RunDisplay, out: TerminalConsole) -> Iterator[None]:
     """Draw a display below what is printed, from any thread, until the end of the block.
 
-    rich's own refresh draws beside what other threads print: each then takes the cursor back by the lines that
-    the other has drawn, and lines of the display stay, or lines of the log go.
+    rich's own refresh draws beside what other threads print: each then takes the cursor back by the lines
+    that the other has drawn, and lines of the display stay, or lines of the log go.
     """
     out.turn = threading.RLock()
     live = Live(display, console=out, auto_refresh=False, transient=True)

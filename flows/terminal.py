@@ -29,8 +29,8 @@ class TerminalConsole(Console):
     """
 
     turn: AbstractContextManager[object] = nullcontext()
-    """Held while something is printed. A live display, which must not be moved between looking where it stands
-    and drawing it, sets a lock that may be taken again, and holds it whenever it draws."""
+    """Held while something is printed. A live display, which must not be moved between looking where it
+    stands and drawing it, sets a lock that may be taken again, and holds it whenever it draws."""
 
     def __enter__(self) -> Self:
         """As rich does: what is printed is written where the outermost of these blocks ends."""
