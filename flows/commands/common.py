@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from flows.wiring import SequenceRun
 
 __all__ = [
+    "StandardErrorHandler",
     "counted",
     "existing_store",
     "finished_run",
@@ -274,7 +275,7 @@ def set_up_logging(*, debug: bool, terminal: bool, quiet: bool = False) -> None:
     level = logging.ERROR if quiet else logging.WARNING if terminal else logging.INFO
     if debug:
         level = logging.INFO
-    handler = _StandardErrorHandler()
+    handler = StandardErrorHandler()
     # The handler's as well as the loggers': a run on a lasting server sends more to its log than is shown.
     handler.setLevel(level)
     handler.addFilter(CredentialFilter())
@@ -284,8 +285,11 @@ def set_up_logging(*, debug: bool, terminal: bool, quiet: bool = False) -> None:
         logging.getLogger(noisy).setLevel(logging.WARNING if debug else logging.CRITICAL)
 
 
-class _StandardErrorHandler(logging.StreamHandler[TextIO]):
-    """Writes to what standard error is at the time: the display of a run must know of each line."""
+class StandardErrorHandler(logging.StreamHandler[TextIO]):
+    """Writes to what standard error is at the time: the display of a run must know of each line.
+
+    Prefect takes the place of handlers whose name begins with an underscore.
+    """
 
     def __init__(self) -> None:
         logging.Handler.__init__(self)

@@ -14,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from flows.cli import main
-from flows.commands.common import _StandardErrorHandler, showing
+from flows.commands.common import StandardErrorHandler, showing
 from flows.printable import PrintableFormatter, printable
 from flows.terminal import console, print_table
 
@@ -69,7 +69,7 @@ def test_in_the_log() -> None:
 
 def test_the_log_goes_where_standard_error_goes_at_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """The display of a run takes its place: a line that went past it was drawn over, and left parts of it."""
-    handler = _StandardErrorHandler()
+    handler = StandardErrorHandler()
     display = io.StringIO()
     monkeypatch.setattr("sys.stderr", display)
     handler.handle(logging.LogRecord("", logging.WARNING, "", 0, "said", None, None))
