@@ -26,7 +26,7 @@ from extrags.store import Store
 from flows.estimate import RunEstimate, expected_seconds
 from flows.previews import stage_preview
 from flows.printable import printable
-from flows.terminal import console
+from flows.terminal import TerminalConsole, console
 from tasks.progress import Pace, StageProgress, duration_text, observed, rate_text
 
 __all__ = ["RunDisplay", "RunInView", "progress_display"]
@@ -47,6 +47,7 @@ SHORTEST_BAR = 6
 SHORTEST_DETAIL = 12
 GAP = 2
 """Columns between the parts of a line."""
+REFRESH_SECONDS = 0.25
 PREVIEW_WAIT_SECONDS = 2.0
 """How long the end of a run waits for a picture that is being made."""
 
@@ -91,8 +92,37 @@ def progress_display(showing: Showing, run: RunInView | None = None) -> Iterator
     previews = nullcontext(None) if run.store is None else _previews(Store(run.store))
     with previews as wanted:
         display = RunDisplay(run, announce=lambda line: out.print(line, highlight=False), preview=wanted)
-        with Live(display, console=out, refresh_per_second=4, transient=True), observed(display):
+        with _live(display, out), observed(display):
             yield
+
+
+@contextmanager
+def _live(display: RunDisplay, out: TerminalConsole) -> Iterator[None]:
+    """Draw a display below what is printed, from any thread, until the end of the block.
+
+    rich's own refresh draws beside what other threads print: each then takes the cursor back by the lines
+    that the other has drawn, and lines of the display stay, or lines of the log go.
+    """
+    out.turn = threading.RLock()
+    live = Live(display, console=out, auto_refresh=False, transient=True)
+    over = threading.Event()
+
+    def refresh() -> None:
+        while not over.wait(REFRESH_SECONDS):
+            with out.turn:
+                live.refresh()
+
+    thread = threading.Thread(target=refresh, name="display", daemon=True)
+    with out.turn:
+        live.start(refresh=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+        with out.turn:
+            live.stop()
 
 
 def _ignore(_: StageProgress) -> None:
@@ -183,16 +213,35 @@ class RunDisplay:
     def __rich_console__(self, out: Console, options: ConsoleOptions) -> RenderResult:
         """What stands below the lines of the stages that have ended."""
         with self._guard:
-            yield from self._lines(self._clock(), options.max_width)
 
-    def _lines(self, now: float, width: int) -> Iterator[Text | Table]:
-        in_work = list(self._estimate.in_work)
-        for label in in_work[:MOST_SEQUENCES]:
-            yield self._stages(label, width)
-            if label in self._loops:
-                yield _loop(*self._loops[label], width)
-        if len(in_work) > MOST_SEQUENCES:
-            yield Text(f"and {len(in_work) - MOST_SEQUENCES} more sequences", style="dim")
+            def height(parts: list[Text | Table]) -> int:
+                return sum(len(out.render_lines(part, options, pad=False)) for part in parts)
+
+            below = list(self._below(self._clock(), options.max_width))
+            room = options.size.height - height(below)
+            in_work, shown = list(self._estimate.in_work), 0
+            for label in in_work[:MOST_SEQUENCES]:
+                block = list(self._in_work(label, options.max_width))
+                # In a low terminal the whole run stays in sight; a line tells of the sequences that do not.
+                room -= height(block)
+                if room < (shown + 1 < len(in_work)):
+                    break
+                yield from block
+                shown += 1
+            left = len(in_work) - shown
+            if left:
+                sequences = "sequence" if left == 1 else "sequences"
+                told = f"and {left} more {sequences}" if shown else f"{left} {sequences} in work"
+                yield Text(told, style="dim")
+            yield from below
+
+    def _in_work(self, label: str, width: int) -> Iterator[Text | Table]:
+        yield self._stages(label, width)
+        if label in self._loops:
+            yield _loop(*self._loops[label], width)
+
+    def _below(self, now: float, width: int) -> Iterator[Text | Table]:
+        """What is of no sequence in work."""
         for label, loop in self._loops.items():
             if label not in self._estimate.in_work:
                 yield _loop(*loop, width)

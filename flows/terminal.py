@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable
-from typing import Any
+from contextlib import AbstractContextManager, nullcontext
+from types import TracebackType
+from typing import Any, Self
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.measure import Measurement
@@ -14,17 +16,36 @@ from rich.text import Text
 
 from flows.printable import printable
 
-__all__ = ["console", "print_table"]
+__all__ = ["TerminalConsole", "console", "print_table"]
 
 FILE_WIDTH = 200
 """Width, in columns, of tables that are written to a file or a pipe."""
 
 
-class _Console(Console):
+class TerminalConsole(Console):
     """Shows text, whatever it holds, instead of letting the terminal obey it.
 
     It leaves it to the command what to do when nobody reads its output any more; rich would exit with 1.
     """
+
+    turn: AbstractContextManager[object] = nullcontext()
+    """Held while something is printed. A live display, which must not be moved between looking where it
+    stands and drawing it, sets a lock that may be taken again, and holds it whenever it draws."""
+
+    def __enter__(self) -> Self:
+        """As rich does: what is printed is written where the outermost of these blocks ends."""
+        self.turn.__enter__()
+        super().__enter__()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """As rich does."""
+        try:
+            super().__exit__(kind, error, trace)
+        finally:
+            self.turn.__exit__(kind, error, trace)
 
     def render_str(self, text: str, **options: Any) -> Text:
         """As rich does."""
@@ -42,12 +63,12 @@ class _Console(Console):
         raise
 
 
-def console(*, error: bool = False) -> Console:
+def console(*, error: bool = False) -> TerminalConsole:
     """A console on standard output (or standard error), with a fixed width for files and pipes."""
     stream = sys.stderr if error else sys.stdout
     width = None if stream.isatty() else FILE_WIDTH
     # Without emoji: names may have `:a:` in them.
-    return _Console(stderr=error, width=width, highlight=False, emoji=False)
+    return TerminalConsole(stderr=error, width=width, highlight=False, emoji=False)
 
 
 def print_table(out: Console, table: Table) -> None:

@@ -13,7 +13,7 @@ import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TextIO, TypeVar
 
 from extrags.errors import ConfigError, ExtragsError, StoreError
 from extrags.redaction import CredentialFilter, without_credentials
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from flows.wiring import SequenceRun
 
 __all__ = [
+    "StandardErrorHandler",
     "counted",
     "existing_store",
     "finished_run",
@@ -274,7 +275,7 @@ def set_up_logging(*, debug: bool, terminal: bool, quiet: bool = False) -> None:
     level = logging.ERROR if quiet else logging.WARNING if terminal else logging.INFO
     if debug:
         level = logging.INFO
-    handler = logging.StreamHandler(sys.stderr)
+    handler = StandardErrorHandler()
     # The handler's as well as the loggers': a run on a lasting server sends more to its log than is shown.
     handler.setLevel(level)
     handler.addFilter(CredentialFilter())
@@ -282,6 +283,21 @@ def set_up_logging(*, debug: bool, terminal: bool, quiet: bool = False) -> None:
     logging.basicConfig(level=level, handlers=[handler])
     for noisy in ("httpx", "httpcore", "prefect", "distributed", "distributed.scheduler", "asyncio"):
         logging.getLogger(noisy).setLevel(logging.WARNING if debug else logging.CRITICAL)
+
+
+class StandardErrorHandler(logging.StreamHandler[TextIO]):
+    """Writes to what standard error is at the time: the display of a run must know of each line.
+
+    Prefect takes the place of handlers whose name begins with an underscore.
+    """
+
+    def __init__(self) -> None:
+        logging.Handler.__init__(self)
+
+    @property
+    def stream(self) -> TextIO:  # type: ignore[override]
+        """Standard error."""
+        return sys.stderr
 
 
 def is_terminal() -> bool:

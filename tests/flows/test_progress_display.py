@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import sys
 from pathlib import Path
 
 import pytest
@@ -21,10 +22,10 @@ from tests.flows.tiny import SEQUENCE
 class Terminal:
     """A display with a clock, and what it printed above itself."""
 
-    def __init__(self, sequences: int = 1, width: int = 110) -> None:
+    def __init__(self, sequences: int = 1, width: int = 110, height: int = 100) -> None:
         self.now = 0.0
         self.printed: list[str] = []
-        self.width = width
+        self.width, self.height = width, height
         self.display = RunDisplay(
             RunInView(sequences), announce=self.printed.append, clock=lambda: self.now, preview=self.preview
         )
@@ -43,7 +44,7 @@ class Terminal:
         self.display(StageProgress(label, stage, state, detail=why, seconds=3.0))
 
     def shown(self) -> str:
-        out = Console(file=io.StringIO(), width=self.width, color_system=None)
+        out = Console(file=io.StringIO(), width=self.width, height=self.height, color_system=None)
         out.print(self.display)
         assert isinstance(out.file, io.StringIO)
         return out.file.getvalue()
@@ -147,11 +148,65 @@ class TestDisplay:
                 assert line.startswith(f"  {stage[:8]}")
                 assert "…" in line
 
+    @pytest.mark.parametrize(
+        ("height", "shown", "told"),
+        [(24, 4, "and 1 more sequence"), (7, 2, "and 3 more sequences"), (3, 0, "5 sequences in work")],
+    )
+    def test_the_whole_run_stays_in_sight_in_a_low_terminal(self, height: int, shown: int, told: str) -> None:
+        terminal = Terminal(sequences=30, width=80, height=height)
+        for number in range(5):
+            terminal.starts("ingest", f"scene{number}")
+        lines = terminal.shown().splitlines()
+        assert len(lines) <= height
+        assert sum("ingest" in line for line in lines) == shown
+        assert told in map(str.strip, lines)
+        assert "0 of 30 sequences done" in lines[-1]
+
+    def test_one_sequence_needs_no_line_that_tells_of_more(self) -> None:
+        terminal = Terminal(width=110, height=3)
+        terminal.starts("ingest")
+        assert "ingest" in terminal.shown()
+        assert "in work" not in terminal.shown()
+
     def test_a_loop_that_is_no_stage_of_a_run(self) -> None:
         terminal = Terminal(sequences=0)
         terminal.at("pretrain", 5, 10)
         assert "pretrain" in terminal.shown()
         assert "whole run" not in terminal.shown()
+
+
+def test_lines_of_others_and_the_display_take_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Between looking where the cursor stands and writing, no other thread moves it."""
+    held = 0
+
+    class Turn:
+        def __enter__(self) -> None:
+            nonlocal held
+            held += 1
+
+        def __exit__(self, *_: object) -> None:
+            nonlocal held
+            held -= 1
+
+    class Written(io.StringIO):
+        def write(self, text: str) -> int:
+            assert held or not text
+            return super().write(text)
+
+        def isatty(self) -> bool:
+            return True
+
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr("flows.progress_display.threading.RLock", Turn)
+    monkeypatch.setattr("flows.progress_display.REFRESH_SECONDS", 60.0)
+    monkeypatch.setattr(sys, "stderr", Written())
+    written = sys.stderr
+    with progress_display("terminal", RunInView(1)):
+        notify(StageProgress("scene", "coarse", "ran", seconds=1.0))
+        print("a line of the log", file=sys.stderr)
+    assert held == 0
+    assert isinstance(written, io.StringIO)
+    assert "a line of the log" in written.getvalue()
 
 
 def test_quiet_says_nothing(caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]) -> None:

@@ -14,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from flows.cli import main
-from flows.commands.common import showing
+from flows.commands.common import StandardErrorHandler, showing
 from flows.printable import PrintableFormatter, printable
 from flows.terminal import console, print_table
 
@@ -65,6 +65,15 @@ def test_in_errors(capsys: pytest.CaptureFixture[str]) -> None:
 def test_in_the_log() -> None:
     record = logging.makeLogRecord({"msg": "frame %s\n  of", "args": (EVIL,)})
     assert PrintableFormatter("%(message)s").format(record) == f"frame {SHOWN}\n  of"
+
+
+def test_the_log_goes_where_standard_error_goes_at_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The display of a run takes its place: a line that went past it was drawn over, and left parts of it."""
+    handler = StandardErrorHandler()
+    display = io.StringIO()
+    monkeypatch.setattr("sys.stderr", display)
+    handler.handle(logging.LogRecord("", logging.WARNING, "", 0, "said", None, None))
+    assert display.getvalue() == "said\n"
 
 
 @pytest.mark.parametrize(
