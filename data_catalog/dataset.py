@@ -46,14 +46,9 @@ class Descriptor(BaseModel):
     videos: tuple[str, ...] = ()
     """Which videos of the scene are used; the one that trains comes first."""
     folder: str | None = None
-    """Folder below a data root; None where no files are needed."""
+    """Folder below a data root; None where no files are needed, or those of several videos are (`videos`)."""
     available: bool = True
     """Whether it can be read on this machine now."""
-
-    @property
-    def drawn(self) -> bool:
-        """Whether its frames are drawn when they are asked for: no files are needed."""
-        return self.folder is None
 
 
 class Source(BaseModel):

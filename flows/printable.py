@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 import re
 
+from extrags.escaped_text import escaped
+
 __all__ = ["PrintableFormatter", "printable"]
 
 _OBEYED = re.compile(
@@ -15,7 +17,7 @@ _OBEYED = re.compile(
 
 def printable(text: str) -> str:
     r"""The text with `\x1b`, as Python writes it, in place of each character that a terminal would obey."""
-    return _OBEYED.sub(lambda found: found[0].encode("unicode_escape").decode("ascii"), text)
+    return escaped(text, _OBEYED)
 
 
 class PrintableFormatter(logging.Formatter):

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from data_catalog import Descriptor, Glance, describe, glance
+from data_catalog.catalog import drawn_formats
 from extrags.config import PipelineConfig
 from extrags.errors import ExtragsError
 from extrags.pipeline import stages_that_can_run
@@ -162,7 +163,8 @@ def _catalogue_work(about: Descriptor, config: PipelineConfig) -> Workload:
     width, height = read_size(about, config)
     frames = float(min(about.frames, config.ingest.max_frames or about.frames))
     held_out = frames / 2
-    return Workload(width * height, frames, held_out, held_out, config, width=width, drawn=about.drawn)
+    drawn = about.format in drawn_formats()
+    return Workload(width * height, frames, held_out, held_out, config, width=width, drawn=drawn)
 
 
 def read_size(about: Descriptor, config: PipelineConfig) -> tuple[float, float]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
+from extrags.escaped_text import escaped
+
 __all__ = ["LONGEST_LABEL", "drawable", "row_labels"]
 
 LONGEST_LABEL = 41
@@ -18,7 +20,7 @@ def drawable(text: str) -> str:
 
     Folders on disks of others can be named with any bytes.
     """
-    return _NOT_DRAWN.sub(lambda found: found[0].encode("unicode_escape").decode("ascii"), text)
+    return escaped(text, _NOT_DRAWN)
 
 
 def row_labels(names: Sequence[str]) -> list[str]:

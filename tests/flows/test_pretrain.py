@@ -270,6 +270,9 @@ def test_any_setting_can_be_given_and_an_ended_training_goes_on(
     first, second = record["resumed"]
     assert "--iterations" not in first["command"]
     assert "--iterations 700" in second["command"]
+    # How busy it was differs from command to command.
+    loads = [made["machine"].pop("load_average") for made in (second, record)]
+    assert min(loads) >= 0
     assert second["machine"] == record["machine"]
     assert main([*given, "--set", "drawn=1"]) == 2
     assert "drawn_share" in capsys.readouterr().err

@@ -7,12 +7,12 @@ from typing import Any
 
 import pytest
 
-from data_catalog import describe
+from data_catalog import describe, list_sequences
 from extrags.config import IngestConfig, PipelineConfig, profile_config
 from extrags.run_costs import Workload, packaged_model, stage_seconds
 from flows.commands.plan import print_detail
 from flows.run_costs import RunPrediction, StageCost
-from flows.workloads import at_detail_size, detail_flags, expected_work, read_size
+from flows.workloads import _catalogue_work, at_detail_size, detail_flags, expected_work, read_size
 
 
 def test_frames_of_the_size_that_keeps_their_detail_cost_less() -> None:
@@ -44,6 +44,15 @@ def test_frames_that_are_drawn_take_longer_than_frames_that_are_read() -> None:
     model = packaged_model()
     as_files = model.predict("ingest", replace(drawn, drawn=False)).seconds
     assert model.predict("ingest", drawn).seconds > 1.5 * as_files
+
+
+def test_only_procedural_scenes_are_drawn() -> None:
+    """Pairs of recordings of C3VD name no folder either, and are read."""
+    config = profile_config("quick")
+    works = {item.name: expected_work(item.name, config) for item in list_sequences() if item.available}
+    drawn = {name.partition("/")[0] for name, work in works.items() if work is not None and work.drawn}
+    assert drawn == {"phantom", "caverns"}
+    assert not _catalogue_work(describe("c3vdv2/c1_cecum_t1@sparse"), config).drawn
 
 
 @pytest.mark.parametrize(
