@@ -129,6 +129,7 @@ class Workload:
         coarse_gaussians: of the coarse scene, where there is one; None: as many as are expected.
         final_gaussians: of the final scene, likewise.
         drawn: whether the frames are drawn by a procedural scene, instead of read.
+        has_depth: whether the source knows their depth, withheld or not.
     """
 
     pixels: float | int
@@ -142,14 +143,22 @@ class Workload:
     coarse_gaussians: float | int | None = None
     final_gaussians: float | int | None = None
     drawn: bool = False
+    has_depth: bool = True
 
     @property
     def size(self) -> dict[str, float]:
-        """What the sequence tells: pixels, frames, those for training and held out, width, `drawn` if so."""
+        """What the sequence tells: pixels, frames, those for training and held out, width.
+
+        Also `drawn` where they are, and `has_depth` where there is none: earlier records tell of neither.
+        """
         found = {name: float(getattr(self, name)) for name in ("pixels", "frames", "train", "test")}
         if self.width is not None:
             found["width"] = float(self.width)
-        return {**found, "drawn": True} if self.drawn else found
+        if self.drawn:
+            found["drawn"] = True
+        if not self.has_depth:
+            found["has_depth"] = False
+        return found
 
     def numbers(self) -> dict[str, float]:
         """By name in terms."""
@@ -167,6 +176,8 @@ class Workload:
             "restored": float(self.pixels) * self._restored_share(),
             "frames": float(self.frames),
             "drawn": float(self.drawn),
+            # What is read with depth is resampled, and held-out pixels are looked for in training frames.
+            "known_depth": float(self.has_depth),
             "train": float(self.train),
             "test": float(self.test),
             "iterations": float(config.coarse.iterations),

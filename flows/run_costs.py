@@ -23,7 +23,7 @@ from extrags.scene_plan import ScenePlan
 from extrags.stages import REGISTRY, STAGES, StageName, cost_of, modelled_tasks
 from extrags.store import Manifest, Store
 from flows.outcome import SequenceOutcome
-from flows.workloads import frames_stages, frames_work, task_repeats
+from flows.workloads import frames_stages, frames_work, knows_depth, task_repeats
 
 __all__ = [
     "Pace",
@@ -375,18 +375,20 @@ def _workload(
     stacks = manifest.counts.get("stacks")
     scenes = {item.stage: item.counts.get("n_gaussians") for item in reversed(line)}
     coarse, final = scenes.get("coarse"), scenes.get("finetune")
+    config = _config(line, fallback)
     return Workload(
         width * height,
         frames,
         train,
         test,
-        _config(line, fallback),
+        config,
         float(views) if views else None,
         width,
         int(stacks) if stacks else 1,
         float(coarse) if coarse else None,
         float(final) if final else None,
         drawn=_is_drawn(source),
+        has_depth=knows_depth(counts, config),
     )
 
 

@@ -21,6 +21,7 @@ __all__ = [
     "frames_stages",
     "frames_work",
     "known_work",
+    "knows_depth",
     "read_size",
     "task_repeats",
     "usual_work",
@@ -75,7 +76,18 @@ def frames_work(
         float(counts[name] or 0) for name in ("width", "height", "frames", "train", "test")
     )
     size = width * height, frames, train, test
-    return Workload(*size, config, width=width, coarse_gaussians=gaussians, drawn=drawn)
+    has_depth = knows_depth(counts, config)
+    return Workload(*size, config, width=width, coarse_gaussians=gaussians, drawn=drawn, has_depth=has_depth)
+
+
+def knows_depth(counts: Mapping[str, Any], config: PipelineConfig) -> bool:
+    """Whether depth was read with the frames, given to training or withheld.
+
+    Args:
+        counts: of the artefact of `ingest`.
+        config: settings of all stages.
+    """
+    return bool(counts.get("has_depth", True)) or config.ingest.withhold_depth
 
 
 def frames_stages(
@@ -147,7 +159,7 @@ def work_before_reading(
     if isinstance(about, Descriptor):
         work = _catalogue_work(about, config)
     else:
-        counts = {name: getattr(about, name) for name in ("width", "height", "train", "test")}
+        counts = {name: getattr(about, name) for name in ("width", "height", "train", "test", "has_depth")}
         work = frames_work({**counts, "frames": about.train + about.test}, config)
     return work, stages_that_can_run(
         config,
@@ -164,7 +176,8 @@ def _catalogue_work(about: Descriptor, config: PipelineConfig) -> Workload:
     frames = float(min(about.frames, config.ingest.max_frames or about.frames))
     held_out = frames / 2
     drawn = about.format in drawn_formats()
-    return Workload(width * height, frames, held_out, held_out, config, width=width, drawn=drawn)
+    size = width * height, frames, held_out, held_out
+    return Workload(*size, config, width=width, drawn=drawn, has_depth=about.has_depth)
 
 
 def read_size(about: Descriptor, config: PipelineConfig) -> tuple[float, float]:

@@ -26,7 +26,17 @@ REGISTRY: tuple[Stage, ...] = (
         other_parts=("ingest",),
         tasks=(
             StageTask(
-                name="ingest", cost=Cost(terms=("one", "frames", "frames*pixels", "drawn*frames*pixels"))
+                name="ingest",
+                cost=Cost(
+                    terms=(
+                        "one",
+                        "frames",
+                        "frames*pixels",
+                        "known_depth*frames*pixels",
+                        "known_depth*test*pixels",
+                        "drawn*frames*pixels",
+                    )
+                ),
             ),
         ),
     ),

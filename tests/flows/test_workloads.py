@@ -12,7 +12,14 @@ from extrags.config import IngestConfig, PipelineConfig, profile_config
 from extrags.run_costs import Workload, packaged_model, stage_seconds
 from flows.commands.plan import print_detail
 from flows.run_costs import RunPrediction, StageCost
-from flows.workloads import _catalogue_work, at_detail_size, detail_flags, expected_work, read_size
+from flows.workloads import (
+    _catalogue_work,
+    at_detail_size,
+    detail_flags,
+    expected_work,
+    frames_work,
+    read_size,
+)
 
 
 def test_frames_of_the_size_that_keeps_their_detail_cost_less() -> None:
@@ -44,6 +51,24 @@ def test_frames_that_are_drawn_take_longer_than_frames_that_are_read() -> None:
     model = packaged_model()
     as_files = model.predict("ingest", replace(drawn, drawn=False)).seconds
     assert model.predict("ingest", drawn).seconds > 1.5 * as_files
+
+
+def test_frames_without_depth_are_read_faster() -> None:
+    config = profile_config("quick")
+    counts = {"width": 960, "height": 890, "frames": 35, "train": 30, "test": 5, "has_depth": 0}
+    without, known = (frames_work({**counts, "has_depth": has_depth}, config) for has_depth in (0, 1))
+    assert (without.has_depth, known.has_depth) == (False, True)
+    assert "has_depth" not in known.size
+    assert Workload(config=config, **without.size) == without
+    # Depth that is withheld was read, and earlier records do not say.
+    assert frames_work(counts, config.with_overrides({"ingest.withhold_depth": True})).has_depth
+    del counts["has_depth"]
+    assert frames_work(counts, config).has_depth
+    model = packaged_model()
+    assert model.predict("ingest", known).seconds > 2 * model.predict("ingest", without).seconds
+    for name, expected in (("sinus/hopkins", False), ("simcol3d/s1", True)):
+        assert (about := expected_work(name, config)) is not None
+        assert about.has_depth is expected
 
 
 def test_only_procedural_scenes_are_drawn() -> None:
