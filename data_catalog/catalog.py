@@ -17,6 +17,7 @@ from data_catalog.c3vd.dataset import C3vdDataset
 from data_catalog.calibration_files import CALIBRATION_VERSION
 from data_catalog.caverns.dataset import CAVERNS
 from data_catalog.checks import check_sequence
+from data_catalog.ct_colon.dataset import CT_COLON
 from data_catalog.dataset import Dataset, Descriptor, Source, file_digests
 from data_catalog.detail import DetailSize, source_detail
 from data_catalog.folder_reader import Glance
@@ -51,6 +52,7 @@ DATASETS: tuple[Dataset, ...] = (
     FolderDataset(),
     PHANTOM,
     CAVERNS,
+    CT_COLON,
     C3vdDataset(),
 )
 """Folders first: a path that exists wins over a name spelled the same."""
@@ -61,7 +63,7 @@ _UNCUT = {name: IngestConfig.model_fields[name].default for name in ("start_s", 
 
 
 def list_sequences() -> tuple[Descriptor, ...]:
-    """Every named sequence; of endless families (phantom, caverns), the first few scenes."""
+    """Every named sequence; of endless families (phantom, caverns, ct_colon), the first few scenes."""
     return tuple(item for dataset in DATASETS for item in dataset.entries())
 
 

@@ -38,7 +38,7 @@ class Descriptor(BaseModel):
     """Which frames are held out."""
     licence: str
     format: str
-    """`phantom`, `caverns` or the name of a folder reader."""
+    """The name of a procedural family (`phantom`, `caverns`, `ct_colon`) or of a folder reader."""
     segment: str | None = None
     """Part of the colon, where the dataset has parts."""
     texture: str | None = None
@@ -61,7 +61,7 @@ class Source(BaseModel):
     dataset: str
     """Name of the `Dataset` that reads it."""
     format: str
-    """`phantom`, `caverns`, or the name of a folder reader."""
+    """The name of a procedural family (`phantom`, `caverns`, `ct_colon`) or of a folder reader."""
     paths: tuple[str, ...] = ()
     """Folders or the file on disk; of several recordings the one that trains comes first."""
 

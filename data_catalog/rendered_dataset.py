@@ -51,7 +51,7 @@ class RenderedDataset(ABC, Generic[C]):
         self._pattern = re.compile(rf"{name}/(?P<scene>\d+)(?:@(?P<setting>\w+))?")
 
     @abstractmethod
-    def record(self, config: C, name: str) -> EndoscopicSequence:
+    def record(self, config: C, source: Source) -> EndoscopicSequence:
         """Render both recordings of a scene."""
 
     @abstractmethod
@@ -66,12 +66,12 @@ class RenderedDataset(ABC, Generic[C]):
     def entries(self) -> Iterator[Descriptor]:
         """The first few scenes in each setting that all families have."""
         for scene in range(_LISTED_SCENES):
-            yield from (self._described(scene, setting) for setting in get_args(Setting))
+            yield from (self.described(scene, setting) for setting in get_args(Setting))
 
     def describe(self, name: str) -> Descriptor | None:
         """The descriptor of any scene; raises `UnknownSequenceError` for a setting that there is not."""
         found = self._scene_and_setting(name)
-        return None if found is None else self._described(*found)
+        return None if found is None else self.described(*found)
 
     def resolve(self, name_or_path: str) -> Source | None:
         """Any scene by name; without a setting the sparse one."""
@@ -91,7 +91,7 @@ class RenderedDataset(ABC, Generic[C]):
 
     def read(self, source: Source, config: IngestConfig) -> EndoscopicSequence:
         """Render both recordings."""
-        return self.record(self.scene_config(source, config), source.name)
+        return self.record(self.scene_config(source, config), source)
 
     def scene_config(self, source: Source, config: IngestConfig) -> C:
         """The scene's settings that follow from the ingest settings.
@@ -122,7 +122,8 @@ class RenderedDataset(ABC, Generic[C]):
             )
         return int(match["scene"]), setting
 
-    def _described(self, scene: int, setting: str) -> Descriptor:
+    def described(self, scene: int, setting: str) -> Descriptor:
+        """What there is to know about a scene."""
         plain: Any = self._config_type(scene=scene, setting=setting)
         train = self.train_frames(plain)
         return Descriptor(

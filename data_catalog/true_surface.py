@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import weakref
 
+from data_catalog.ct_colon.model import FOLDER
+from data_catalog.named_folders import find_folder
 from extrags.metrics.surface import TrueSurface, surface_from_depth
 from extrags.sequence import EndoscopicSequence
 from extrags.surface import Mesh
@@ -46,4 +48,13 @@ def _made(sequence: EndoscopicSequence) -> TrueSurface | None:
 
         cavern = build_cavern(CavernConfig.model_validate(caverns).scene).wall
         return TrueSurface(Mesh(cavern.vertices, cavern.triangles), "mesh")
+    colon = sequence.truth.get("ct_colon")
+    folder = find_folder((FOLDER,))
+    # Its files may have gone since it was read.
+    if colon is not None and folder is not None and sequence.truth.get("world") != "estimated":
+        from data_catalog.ct_colon.config import CtColonConfig
+        from data_catalog.ct_colon.stretch import build_stretch
+
+        stretch = build_stretch(CtColonConfig.model_validate(colon).scene, folder).wall
+        return TrueSurface(Mesh(stretch.vertices, stretch.triangles), "mesh")
     return surface_from_depth(sequence)

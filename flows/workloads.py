@@ -190,7 +190,7 @@ def read_size(about: Descriptor, config: PipelineConfig) -> tuple[float, float]:
     from data_catalog.rendered_size import rendered_size
 
     ingest = config.ingest
-    if about.format in ("phantom", "caverns"):
+    if about.format in drawn_formats():
         return rendered_size(ingest, about.width, about.height)
     width, height = SINUS_BOX if about.format == "sinus" else (about.width, about.height)
     if ingest.width is not None:

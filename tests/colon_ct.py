@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from data_catalog.ct_colon.model import FOLDER, ColonModel
 from data_catalog.ray_casting import RayCaster
 from extrags.cameras import Cameras, look_at
 from extrags.gaussians import Gaussians
@@ -16,7 +16,6 @@ from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence, Split
 from extrags.surface import Mesh
 
-FOLDER = Path("colon_ct_gca/EdinGCA_3D_00090")
 FIELD_OF_VIEW_DEG = 100.0
 LOOK_AHEAD_MM = 12.0
 
@@ -31,15 +30,8 @@ class ColonCT:
     @classmethod
     def read(cls, data: Path, *, triangles: str = "20k") -> ColonCT:
         """Read the surface of 20k or 100k triangles from the folder of shared data."""
-        words = (data / FOLDER / f"Surfaces/large_intestine_{triangles}.vtk").read_text().split()
-        at = words.index("POINTS")
-        n = int(words[at + 1])
-        vertices = np.array(words[at + 3 : at + 3 + 3 * n], dtype=np.float32).reshape(n, 3)
-        at = words.index("POLYGONS")
-        n = int(words[at + 1])
-        faces = np.array(words[at + 3 : at + 3 + 4 * n], dtype=np.int32).reshape(n, 4)[:, 1:]
-        path = json.loads((data / FOLDER / "Paths/large_intestine_path.jsn").read_text())
-        return cls(Mesh(vertices, faces), np.array(path["points"], dtype=np.float64))
+        model = ColonModel.read(data / FOLDER, triangles)
+        return cls(Mesh(model.vertices, model.triangles.astype(np.int32)), model.centre_line_mm)
 
     def stretch(
         self,
@@ -65,14 +57,10 @@ class ColonCT:
             noise_mm: standard deviation of the Gaussians' distance from the wall.
             seed: of the samples on the wall.
         """
-        along = np.concatenate([[0], np.linalg.norm(np.diff(self.centre_line_mm, axis=0), axis=1).cumsum()])
-
-        def at(s: np.ndarray | float) -> np.ndarray:
-            return np.stack([np.interp(s, along, axis) for axis in self.centre_line_mm.T], axis=-1)
-
+        line = ColonModel(self.wall.vertices, self.wall.triangles, self.centre_line_mm)
         poses = np.stack(
             [
-                look_at(at(s), at(s + LOOK_AHEAD_MM), np.array([0.0, 0, 1]))
+                look_at(line.at(np.asarray(s)), line.at(np.asarray(s + LOOK_AHEAD_MM)), np.array([0.0, 0, 1]))
                 for s in np.linspace(from_mm, to_mm, views)
             ]
         )

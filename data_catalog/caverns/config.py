@@ -36,9 +36,21 @@ class CavernConfig(BaseModel):
         None, ge=2, description="render at most so many, thinned evenly in both recordings"
     )
 
+    @property
+    def seed(self) -> int:
+        """Number of the random streams."""
+        return self.scene
+
+    @property
+    def aside(self) -> float:
+        """Factor of how far cameras go to the side of the passage."""
+        return 1.0
+
 
 def stream(scene: int, purpose: str, *indices: int) -> np.random.Generator:
-    """The random stream of a cavern for one purpose; streams do not influence each other.
+    """The random stream of a scene for one purpose; streams do not influence each other.
+
+    The scene's number is `CavernConfig.seed`.
 
     No index and the index 0 give the same stream: numpy fills a short seed up with zeros. (So vignetting and
     gamma of a cavern come from the same numbers as exposure and first colour gain of recording A.)

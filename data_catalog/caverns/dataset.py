@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from data_catalog.caverns.config import GENERATOR_VERSION, CavernConfig
+from data_catalog.dataset import Source
 from data_catalog.rendered_dataset import RenderedDataset
 from extrags.sequence import EndoscopicSequence
 
@@ -12,11 +13,11 @@ __all__ = ["CAVERNS"]
 class CavernsDataset(RenderedDataset[CavernConfig]):
     """Procedural caverns that nothing is trained on, rendered on request."""
 
-    def record(self, config: CavernConfig, name: str) -> EndoscopicSequence:
+    def record(self, config: CavernConfig, source: Source) -> EndoscopicSequence:
         """Render both recordings of a scene."""
         from data_catalog.caverns.recording import record
 
-        return record(config, name)
+        return record(config, source.name)
 
     def train_frames(self, config: CavernConfig) -> int:
         """Frames of the training recording."""

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from data_catalog.caverns.config import stream
 from data_catalog.cavities.surface import Lattice, Wall, contour
 
-__all__ = ["Cavern", "build_cavern"]
+__all__ = ["Cavern", "Passage", "build_cavern"]
 
 _CHAMBERS = 7
 _SOFTNESS = 2.2
@@ -26,18 +26,27 @@ _MARGIN_MM = 4.0
 
 
 @dataclass(frozen=True)
-class Cavern:
-    """A cavern's wall and the middle of its chain of chambers.
+class Passage:
+    """A wall, and a line between its sides that a camera can follow.
 
     Args:
         wall: the mesh, in mm.
-        lattice: the clearance it was contoured from; positive in free space.
-        middle: a line through all chambers, in mm, evenly spaced, [K, 3].
+        middle: the line, in mm, evenly spaced, [K, 3].
     """
 
     wall: Wall
-    lattice: Lattice
     middle: Float[np.ndarray, "k 3"]
+
+
+@dataclass(frozen=True)
+class Cavern(Passage):
+    """A cavern's wall and a line through all chambers of its chain.
+
+    Args:
+        lattice: the clearance it was contoured from; positive in free space.
+    """
+
+    lattice: Lattice
 
 
 @dataclass(frozen=True)
@@ -89,7 +98,7 @@ def build_cavern(scene: int) -> Cavern:
     reach = 19.0
     low, high = middle.min(axis=0) - reach - _MARGIN_MM, middle.max(axis=0) + reach + _MARGIN_MM
     lattice = Lattice.of(clearance, low, high, _NODES).without_islands().smoothed(0.8)
-    return Cavern(contour(lattice), lattice, middle)
+    return Cavern(contour(lattice), middle, lattice)
 
 
 def _chain(rng: np.random.Generator) -> Float[np.ndarray, "c 3"]:

@@ -14,9 +14,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from data_catalog.caverns.config import GENERATOR_VERSION, CavernConfig, stream
-from data_catalog.caverns.geometry import Cavern, build_cavern
-from data_catalog.caverns.texture import CellTexture, make_texture
-from data_catalog.cavities.camera import pinhole, radiance, z_depth
+from data_catalog.caverns.geometry import Passage, build_cavern
+from data_catalog.caverns.texture import make_texture
+from data_catalog.cavities.camera import Painted, pinhole, radiance, z_depth
 from data_catalog.cavities.lamps import Lamps
 from data_catalog.phantom.imaging import Sensor
 from data_catalog.ray_casting import RayCaster
@@ -24,7 +24,7 @@ from extrags.cameras import Cameras, look_at, pixel_rays, rotation_about
 from extrags.events import Progress, emit
 from extrags.sequence import EndoscopicSequence, Split
 
-__all__ = ["MIN_CLEARANCE_MM", "record", "recording_cameras"]
+__all__ = ["MIN_CLEARANCE_MM", "record", "recorded", "recording_cameras"]
 
 MIN_CLEARANCE_MM = 2.5
 """The lens keeps this distance from the wall wherever the line through the chambers does.
@@ -47,21 +47,36 @@ _EXPOSURE_SPREAD, _BALANCE_SPREAD, _DRIFT = 0.08, 0.02, 0.015
 def record(config: CavernConfig, name: str) -> EndoscopicSequence:
     """Render a cavern's two recordings and their ground truth."""
     cavern = build_cavern(config.scene)
-    texture = make_texture(config.scene, cavern.wall)
-    rays = RayCaster(cavern.wall.vertices, cavern.wall.triangles)
-    lamps = Lamps.random(stream(config.scene, "light"))
+    truth = {"generator_version": GENERATOR_VERSION, "caverns": config.model_dump()}
+    return recorded(config, name, cavern, make_texture(config.scene, cavern.wall), truth)
+
+
+def recorded(
+    config: CavernConfig, name: str, passage: Passage, texture: Painted, truth: dict[str, Any]
+) -> EndoscopicSequence:
+    """Two recordings of a passage and their ground truth.
+
+    Args:
+        config: of the recordings.
+        name: of the sequence.
+        passage: that the cameras follow.
+        texture: of its wall.
+        truth: what the passage was made from.
+    """
+    rays = RayCaster(passage.wall.vertices, passage.wall.triangles)
+    lamps = Lamps.random(stream(config.seed, "light"))
     train, test = _frames(config)
     parts = {_TRAINS: ("b", train, config.train_frames), _EVALUATES: ("a", test, config.test_frames)}
     total = len(train) + len(test)
     rgb, cameras, recording, names, exposures = [], [], [], [], []
-    gain = _gain(config, cavern, texture, lamps, rays)
+    gain = _gain(config, passage, texture, lamps, rays)
     for index, (letter, frames, count) in parts.items():
-        views = recording_cameras(config, cavern, rays, letter, frames / max(count - 1, 1))
+        views = recording_cameras(config, passage, rays, letter, frames / max(count - 1, 1))
         sensor = _sensor(config, index, gain)
         for k, frame in enumerate(frames):
-            rng = stream(config.scene, "noise", index, int(frame))
+            rng = stream(config.seed, "noise", index, int(frame))
             exposure = sensor.exposure(rng)
-            light = radiance(cavern.wall, texture, lamps, rays, views[k], config.supersample)
+            light = radiance(passage.wall, texture, lamps, rays, views[k], config.supersample)
             rgb.append(sensor.develop(light, exposure, rng))
             exposures.append(exposure)
             recording.append(index)
@@ -78,12 +93,7 @@ def record(config: CavernConfig, name: str) -> EndoscopicSequence:
         directions = pixel_rays(every[k])[0][valid[k]]
         points = every.centers[k] + directions * depth[k][valid[k]][:, None].astype(np.float64)
         observed[k][valid[k]] = rays.seen_by(points, every[seen])
-    truth: dict[str, Any] = {
-        "generator_version": GENERATOR_VERSION,
-        "caverns": config.model_dump(),
-        "exposure": exposures,
-        "unseen_share_mean": float(1 - observed[len(train) :].mean()),
-    }
+    unseen = float(1 - observed[len(train) :].mean())
     return EndoscopicSequence(
         name=name,
         rgb=np.stack(rgb),
@@ -96,33 +106,33 @@ def record(config: CavernConfig, name: str) -> EndoscopicSequence:
         frame_names=tuple(names),
         metric=True,
         observed=observed,
-        truth=truth,
+        truth={**truth, "exposure": exposures, "unseen_share_mean": unseen},
     )
 
 
 def recording_cameras(
-    config: CavernConfig, cavern: Cavern, rays: RayCaster, letter: str, share: Float[np.ndarray, "n"]
+    config: CavernConfig, passage: Passage, rays: RayCaster, letter: str, share: Float[np.ndarray, "n"]
 ) -> Cameras:
     """Cameras of recording `a` (evaluates) or `b` (trains) at shares of its duration."""
     style = "b" if letter == "b" else config.setting
     length, side, room_share, turn, swing = _STYLES[style]
-    reference = stream(config.scene, "trajectory").uniform(0, 2 * np.pi)
-    phases = stream(config.scene, "trajectory", 1 + list(_STYLES).index(style)).uniform(0, 2 * np.pi, 6)
-    last = len(cavern.middle) - 1
+    reference = stream(config.seed, "trajectory").uniform(0, 2 * np.pi)
+    phases = stream(config.seed, "trajectory", 1 + list(_STYLES).index(style)).uniform(0, 2 * np.pi, 6)
+    last = len(passage.middle) - 1
     at = last * (0.5 + length * (share - 0.5)) + 3 * np.sin(2 * np.pi * 2.7 * share + phases[0])
     at = np.clip(at, 0, last)
     up = np.array([0.0, 0.6, 0.8])
     poses = []
     for k, place in enumerate(at):
-        center, ahead = _along(cavern.middle, place), _along(cavern.middle, place + 2 * _LOOK_AHEAD_MM)
+        center, ahead = _along(passage.middle, place), _along(passage.middle, place + 2 * _LOOK_AHEAD_MM)
         if np.linalg.norm(ahead - center) < 2:
-            ahead = 2 * center - _along(cavern.middle, place - 2 * _LOOK_AHEAD_MM)
+            ahead = 2 * center - _along(passage.middle, place - 2 * _LOOK_AHEAD_MM)
         base = look_at(center, ahead, up)[:3, :3]
         angle = reference + side + 0.5 * np.sin(2 * np.pi * 0.9 * share[k] + phases[1])
         aside = base @ np.array([np.cos(angle), np.sin(angle), 0.0])
         free = float(rays.clearance_mm(center[None].astype(np.float32))[0]) - MIN_CLEARANCE_MM
         for factor in (1.0, 0.7, 0.4, 0.2, 0.0):
-            moved = center + factor * room_share * max(free, 0.0) * aside
+            moved = center + factor * room_share * config.aside * max(free, 0.0) * aside
             if float(rays.clearance_mm(moved[None].astype(np.float32))[0]) >= MIN_CLEARANCE_MM:
                 break
         tilt = np.radians(turn + swing * np.sin(2 * np.pi * 2.1 * share[k] + phases[2]))
@@ -143,22 +153,22 @@ def _along(middle: Float[np.ndarray, "k 3"], place: float) -> Float[np.ndarray, 
     return np.array([np.interp(at, np.arange(len(middle)), middle[:, axis]) for axis in range(3)])
 
 
-def _gain(config: CavernConfig, cavern: Cavern, texture: CellTexture, lamps: Lamps, rays: RayCaster) -> float:
-    """Exposure that suits the cavern: from a few small views of the training recording."""
+def _gain(config: CavernConfig, passage: Passage, texture: Painted, lamps: Lamps, rays: RayCaster) -> float:
+    """Exposure that suits the passage: from a few small views of the training recording."""
     small = config.model_copy(update={"width": 40, "height": 32})
-    probe = recording_cameras(small, cavern, rays, "b", np.linspace(0.1, 0.9, 5))
+    probe = recording_cameras(small, passage, rays, "b", np.linspace(0.1, 0.9, 5))
     levels = [
-        np.quantile(radiance(cavern.wall, texture, lamps, rays, probe[k], 1).mean(axis=2), 0.6)
+        np.quantile(radiance(passage.wall, texture, lamps, rays, probe[k], 1).mean(axis=2), 0.6)
         for k in range(5)
     ]
     return float(_LEVEL / np.median(levels))
 
 
 def _sensor(config: CavernConfig, index: int, gain: float) -> Sensor:
-    rng = stream(config.scene, "exposure", index)
+    rng = stream(config.seed, "exposure", index)
     factor = 1 + _EXPOSURE_SPREAD * rng.uniform(-1, 1)
     balance = 1 + _BALANCE_SPREAD * rng.uniform(-1, 1, 3)
-    common = stream(config.scene, "exposure")
+    common = stream(config.seed, "exposure")
     return Sensor(
         gain * factor,
         (float(balance[0]), float(balance[1]), float(balance[2])),

@@ -15,7 +15,7 @@ from data_catalog.cavities.canvas import TEXEL_MM, Canvas
 from data_catalog.named_folders import find_folder, not_on_this_machine
 from extrags.errors import SourceError
 
-__all__ = ["FOLDER", "photographed_tile", "texture_files"]
+__all__ = ["FOLDER", "judging_files", "photographed_tile", "texture_files"]
 
 FOLDER = "laparoscopy_frames_40"
 _PATCH = 256
@@ -30,7 +30,7 @@ than the diagonal of a cell, 122 texels, so that every place is covered."""
 
 
 def texture_files(folder: Path | None = None) -> list[Path]:
-    """The frames that may be used as material.
+    """The frames that training may use as material.
 
     Args:
         folder: that holds them; None looks below the data roots.
@@ -39,10 +39,22 @@ def texture_files(folder: Path | None = None) -> list[Path]:
         SourceNotFoundError: when there is no such folder.
         SourceError: when it holds no frames.
     """
+    return _frames(folder)[::2]
+
+
+def judging_files(folder: Path | None = None) -> list[Path]:
+    """The other frames, which no training takes; otherwise as `texture_files`."""
+    files = _frames(folder)[1::2]
+    if not files:
+        raise SourceError("one frame alone; every second one is for judging", file=folder)
+    return files
+
+
+def _frames(folder: Path | None) -> list[Path]:
     found = find_folder((FOLDER,)) if folder is None else folder
     if found is None:
         raise not_on_this_machine("real textures", FOLDER, "no --real-textures")
-    files = sorted(found.glob("*.jpg"))[::2]
+    files = sorted(found.glob("*.jpg"))
     if not files:
         raise SourceError("no frames (*.jpg)", file=found)
     return files

@@ -164,6 +164,8 @@ def make_skin(
     rng: np.random.Generator,
     radius_mm: float,
     photograph: Float[np.ndarray, "s s 6"] | None = None,
+    *,
+    patches: bool = True,
 ) -> Skin:
     """The skin of a wall, drawn.
 
@@ -175,6 +177,7 @@ def make_skin(
         rng: source of randomness.
         radius_mm: typical radius of the cavity.
         photograph: a tile made of a real frame, which takes the place of the ordinary tissue.
+        patches: whether something may lie over the ordinary tissue in places.
     """
     palette = draw_palette(kind, rng)
     size = 0.6 if kind in ("airways", "oesophagus", "joint", "sinus") else 1.0
@@ -189,9 +192,9 @@ def make_skin(
         # It was taken in white light, which is not the light of every scene.
         ground = np.concatenate([palette.seen(photograph[..., :3]), photograph[..., 3:]], axis=2)
     layers = [_layer(ground, rng, -1, 0.0, 1.0, 0.0, 0.0)]
-    patches = [name for name, share in _PATCHES[kind].items() if rng.random() < share]
-    rng.shuffle(patches)
-    for name in patches[:_MOST_PATCHES]:
+    found = [name for name, share in _PATCHES[kind].items() if patches and rng.random() < share]
+    rng.shuffle(found)
+    for name in found[:_MOST_PATCHES]:
         field = SolidNoise.random(rng, rng.uniform(25.0, 80.0) * size, rng.uniform(6, 14) * size)(
             wall.vertices
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from data_catalog.dataset import Source
 from data_catalog.phantom.config import GENERATOR_VERSION, PhantomConfig
 from data_catalog.phantom.thorough import PASSES
 from data_catalog.rendered_dataset import RenderedDataset
@@ -13,11 +14,11 @@ __all__ = ["PHANTOM"]
 class PhantomDataset(RenderedDataset[PhantomConfig]):
     """Procedural colons, rendered on request."""
 
-    def record(self, config: PhantomConfig, name: str) -> EndoscopicSequence:
+    def record(self, config: PhantomConfig, source: Source) -> EndoscopicSequence:
         """Render the recordings of a scene."""
         from data_catalog.phantom.recording import record
 
-        return record(config, name)
+        return record(config, source.name)
 
     def train_frames(self, config: PhantomConfig) -> int:
         """Frames that train; in the setting `pocket`, those it leaves out included."""

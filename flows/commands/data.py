@@ -84,8 +84,9 @@ def list_all(given: argparse.Namespace) -> int:
     if not sequences:
         near = did_you_mean(given.pattern, (item.name for item in list_sequences()))
         print(
-            f"extrags: nothing in the list matches {given.pattern}{near or ';'} of phantoms and caverns the "
-            "first few are listed, @sparse and @distanced, and others are given by their whole name",
+            f"extrags: nothing in the list matches {given.pattern}{near or ';'} of phantom, caverns and "
+            "ct_colon the first few are listed, @sparse and @distanced, and others are given by their whole "
+            "name",
             file=sys.stderr,
         )
     if given.json != "-":

@@ -63,7 +63,9 @@ class TestDatasets:
 
     def test_a_source_of_no_dataset(self) -> None:
         source = data_catalog.resolve("phantom/0").model_copy(update={"dataset": "attic"})
-        with pytest.raises(ConfigError, match="no dataset 'attic'; known: folders, phantom, caverns, c3vd"):
+        with pytest.raises(
+            ConfigError, match="no dataset 'attic'; known: folders, phantom, caverns, ct_colon, c3vd"
+        ):
             data_catalog.read(source)
 
     def test_reading_marks_the_highlights(self) -> None:

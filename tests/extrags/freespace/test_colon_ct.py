@@ -7,12 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from data_catalog.ct_colon.model import FOLDER
 from extrags.config import ExploreConfig, FreespaceConfig
 from extrags.exploration import explore
 from extrags.freespace import carve
 from extrags.surface import fuse_surface
 from tests.benchmarks.bench_freespace import Truth, measured
-from tests.colon_ct import FOLDER, ColonCT
+from tests.colon_ct import ColonCT
 
 
 @pytest.mark.parametrize("begin_mm", [20.0, pytest.param(1200.0, marks=pytest.mark.slow)])
