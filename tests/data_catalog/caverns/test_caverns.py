@@ -12,10 +12,10 @@ from data_catalog.caverns.recording import MIN_CLEARANCE_MM, recording_cameras
 from data_catalog.caverns.texture import make_texture
 from data_catalog.ray_casting import RayCaster
 from data_catalog.true_surface import true_surface
-from extrags.cameras import pixel_rays
 from extrags.config import IngestConfig
 from extrags.errors import UnknownSequenceError
 from extrags.sequence import EndoscopicSequence
+from tests.data_catalog.true_depth import off_the_surface_mm
 
 TINY = IngestConfig(width=32, max_frames=6)
 
@@ -63,10 +63,7 @@ def test_depth_lies_on_the_true_surface(sequence: EndoscopicSequence, cavern: Ca
     assert truth is not None
     np.testing.assert_array_equal(truth.mesh.vertices, cavern.wall.vertices)
     rays = RayCaster(cavern.wall.vertices, cavern.wall.triangles)
-    camera = sequence.cameras[4]
-    assert sequence.depth_mm is not None
-    points = camera.centers[0] + pixel_rays(camera)[0] * sequence.depth_mm[4][..., None].astype(np.float64)
-    assert rays.clearance_mm(points.reshape(-1, 3)).max() < 1e-2
+    assert off_the_surface_mm(sequence, 4, rays).max() < 1e-2
 
 
 @pytest.mark.parametrize("setting", ["sparse", "distanced"])

@@ -18,10 +18,10 @@ from data_catalog.ct_colon.model import FOLDER, PATH_FILE, ColonModel
 from data_catalog.ct_colon.stretch import STRETCH_MM, build_stretch
 from data_catalog.ray_casting import RayCaster
 from data_catalog.true_surface import true_surface
-from extrags.cameras import pixel_rays
 from extrags.config import IngestConfig
 from extrags.errors import SourceError, SourceNotFoundError, UnknownSequenceError
 from extrags.sequence import EndoscopicSequence
+from tests.data_catalog.true_depth import off_the_surface_mm
 
 TINY = IngestConfig(width=32, max_frames=6)
 RADIUS_MM, LENGTH_MM = 12.0, 320.0
@@ -228,10 +228,7 @@ def test_depth_lies_on_the_true_surface(sequence: EndoscopicSequence, real: Path
     wall = build_stretch(1, real / FOLDER).wall
     np.testing.assert_array_equal(truth.mesh.vertices, wall.vertices)
     rays = RayCaster(wall.vertices, wall.triangles)
-    camera = sequence.cameras[4]
-    assert sequence.depth_mm is not None
-    points = camera.centers[0] + pixel_rays(camera)[0] * sequence.depth_mm[4][..., None].astype(np.float64)
-    assert rays.clearance_mm(points.reshape(-1, 3)).max() < 1e-2
+    assert off_the_surface_mm(sequence, 4, rays).max() < 1e-2
 
 
 @pytest.mark.parametrize("scene", [0, 2])
