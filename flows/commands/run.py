@@ -41,7 +41,7 @@ from flows.commands.run_checks import check_names, check_working_distance, wrong
 from flows.failures import describe_error
 from flows.interruption import RESUMABLE, say_when_interrupted
 from flows.outcome import DatasetFailedError, DatasetOutcome, SequenceOutcome, failed_outcome
-from flows.printable import printable
+from flows.printable import in_one_line
 
 if TYPE_CHECKING:
     from extrags.stages import StageName
@@ -149,7 +149,7 @@ def run(given: argparse.Namespace) -> int:
         print_outcomes(outcome, seconds)
     errors = [sequence.error for sequence in outcome.sequences if sequence.error is not None]
     for hint in dict.fromkeys(hint for error in errors for hint in describe_error(error)[1:]):
-        print(f"extrags: {printable(hint)}", file=sys.stderr)
+        print(f"extrags: {in_one_line(hint)}", file=sys.stderr)
     write_json(outcome.to_json(seconds), given.json)
     return 0 if all(sequence.status == "ok" for sequence in outcome.sequences) else 1
 
