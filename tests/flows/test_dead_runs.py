@@ -305,6 +305,7 @@ def test_outside_a_run_there_is_no_lease(tmp_path: Path) -> None:
 
 def test_the_automation_is_made_once() -> None:
     assert provide_automation() == "created"
+    assert provide_automation() == "unchanged"
     assert provide_automation(dead_run_automation(3600)) == "updated"
     with get_client(sync_client=True) as client:
         (automation,) = client.read_automations_by_name(NAME)
