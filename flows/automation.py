@@ -54,7 +54,9 @@ def dead_run_automation(seconds: float = MISSED_BEATS * DEFAULT_HEARTBEAT_SECOND
     )
 
 
-def provide_automation(automation: AutomationCore | None = None) -> Literal["created", "updated", "unchanged"]:
+def provide_automation(
+    automation: AutomationCore | None = None,
+) -> Literal["created", "updated", "unchanged"]:
     """Create the automation on the server, or make the one of its name as it should be."""
     wanted = automation or dead_run_automation()
     with get_client(sync_client=True) as client:

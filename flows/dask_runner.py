@@ -26,7 +26,7 @@ from distributed.diagnostics.plugin import WorkerPlugin
 from prefect.settings import PREFECT_API_URL
 from prefect_dask import DaskTaskRunner
 
-from extrags.errors import ConfigError
+from extrags.errors import ConfigError, reason_of
 from tasks.machine import asks_for_gpu
 from tasks.page_choice import PAGE_VARIABLE
 
@@ -101,7 +101,7 @@ class ClusterTaskRunner(DaskTaskRunner):  # type: ignore[misc]
             try:
                 self._client.unregister_worker_plugin(self._run)
             except Exception as error:
-                log.warning("the Dask workers were not told of the end: %s", error)
+                log.warning("the Dask workers were not told of the end: %s", reason_of(error))
         super().__exit__(*args)
 
     def threads_for(self, tasks: int) -> int | None:

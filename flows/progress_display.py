@@ -21,6 +21,7 @@ from rich.table import Table
 from rich.text import Text
 
 from extrags.config import DEFAULT_PROFILE, profile_config
+from extrags.errors import reason_of
 from extrags.stages import StageName, stages_until
 from extrags.store import Store
 from flows.estimate import RunEstimate, expected_seconds
@@ -344,7 +345,7 @@ def _previews(store: Store) -> Iterator[Callable[[StageProgress, Callable[[str],
             try:
                 found = stage_preview(progress.label, progress.stage, progress.made, store)
             except Exception as error:
-                log.info("no picture of %s %s: %s", progress.label, progress.stage, error)
+                log.info("no picture of %s %s: %s", progress.label, progress.stage, reason_of(error))
                 continue
             if found is not None:
                 path, words = found
