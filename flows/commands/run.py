@@ -28,7 +28,6 @@ from flows.commands.common import (
     write_json,
 )
 from flows.commands.options import (
-    DEFAULT_METHOD,
     Parser,
     add_json,
     add_method,
@@ -121,8 +120,12 @@ def run(given: argparse.Namespace) -> int:
         )
     if given.seeds and given.seed is not None:
         raise ConfigError("--seeds stands in place of --seed: give one of the two")
-    if given.methods and given.method != DEFAULT_METHOD:
+    if given.methods and getattr(given, "said_method", False):
         raise ConfigError("--methods stands in place of --method: give one of the two")
+    matrix = parsed_matrix(given.matrix)
+    for name in matrix:
+        if name in getattr(given, "said_settings", {}):
+            raise ConfigError(f"--matrix {name} stands in place of --{name} and --set: give one of them")
     begun = time.monotonic()
     outcome = execute(
         sequences,
@@ -135,7 +138,7 @@ def run(given: argparse.Namespace) -> int:
             only=given.only,
             methods=tuple(parsed_methods(given.methods, given.method)),
             seeds=tuple(parsed_seeds(given.seeds) if given.seeds else [given.seed]),
-            matrix=parsed_matrix(given.matrix),
+            matrix=matrix,
         ),
     )
     seconds = time.monotonic() - begun
