@@ -550,8 +550,17 @@ class TestHiddenDepth:
         CompletionNetwork().load_state_dict({name: value.float() for name, value in weights.items()})
         # Whoever may read the record may read the weights.
         assert (out / "hidden.safetensors").stat().st_mode == (out / "hidden.json").stat().st_mode
-        # What could be explored is kept.
+        # What could be explored is kept, and why the other could not.
+        caplog.clear()
         assert main([*given, "--output", str(tmp_path / "again")]) == 0
+        assert made[3:] == []
+        failure = tmp_path / "scenes" / "hidden_depth" / "cavities_00000.failed.json"
+        assert (
+            f"cavities_00000: left out, nothing to explore (an earlier attempt of this version, {failure}"
+            in (caplog.text)
+        )
+        monkeypatch.setattr(pretrain_scenes, "__version__", "another")
+        assert main([*given, "--output", str(tmp_path / "later")]) == 0
         assert made[3:] == ["cavities 0"]
 
     def test_wrong_settings_are_named(
