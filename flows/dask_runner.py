@@ -34,6 +34,10 @@ __all__ = ["ClusterTaskRunner", "needed_resources"]
 
 log = logging.getLogger(__name__)
 
+# Importing it has set the level anew: each connection, and each stream that a client closes, would be told.
+if logging.getLogger("distributed").level == logging.INFO:
+    logging.getLogger("distributed").setLevel(logging.WARNING)
+
 PASSED_ON = (
     "PREFECT_API_URL",
     "PREFECT_API_KEY",
