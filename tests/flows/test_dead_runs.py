@@ -188,6 +188,9 @@ DAY_S = 86400.0
         (None, True, 0, True),
         (None, False, 31, False),
         (None, True, 31, False),
+        # A clock was ahead, here or there: how old it is, nobody knows.
+        (None, False, -400, True),
+        (Completed(), False, -400, False),
     ],
     ids=lambda value: value.name if isinstance(value, State) else str(value),
 )
@@ -232,6 +235,7 @@ def test_leases_of_runs_that_ended_go_wherever_they_ran(
     ("name", "content", "days", "held", "kept"),
     [
         ("a.part", '{"flow_run": "', 31, False, False),
+        ("a.part", '{"flow_run": "', -400, False, True),
         ("a.part", '{"flow_run": "', 29, False, True),
         ("a.part", '{"flow_run": "', 31, True, True),
         ("a.lease", "", 31, False, False),
