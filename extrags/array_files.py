@@ -169,8 +169,10 @@ def load_ply_vertices(file: Path) -> np.ndarray:
     try:
         with file.open("rb") as stream:
             header = stream.read(_PLY_HEADER_BYTES).partition(b"end_header")[0]
-        counts = [line.split()[-1] for line in header.splitlines() if line.startswith(b"element ")]
-        if sum(int(count) for count in counts) > file.stat().st_size:
+        counts = [int(line.split()[-1]) for line in header.splitlines() if line.startswith(b"element ")]
+        if min(counts, default=0) < 0:
+            raise ValueError(f"{min(counts)} elements announced")
+        if sum(counts) > file.stat().st_size:
             raise ValueError("more elements announced than the file has bytes: it is truncated")
         # Mapped, and copied at once: without a map plyfile makes every number on its own, a million a second.
         return np.array(PlyData.read(str(file), mmap="r")["vertex"].data)

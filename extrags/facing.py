@@ -167,7 +167,8 @@ def laid_over(front: Rendering, back: Rendering) -> Rendering:
         front,
         rgb=front.rgb + left[..., None] * back.rgb,
         alpha=alpha,
-        depth=torch.where(alpha > 0, distance / alpha.clamp_min(torch.finfo(alpha.dtype).tiny), 0),
+        # Of nothing the distance is 0 as well.
+        depth=distance / alpha.clamp_min(torch.finfo(alpha.dtype).tiny),
         median_depth=None,
     )
 

@@ -54,7 +54,9 @@ def dead_run_automation(seconds: float = MISSED_BEATS * DEFAULT_HEARTBEAT_SECOND
     )
 
 
-def provide_automation(automation: AutomationCore | None = None) -> Literal["created", "updated"]:
+def provide_automation(
+    automation: AutomationCore | None = None,
+) -> Literal["created", "updated", "unchanged"]:
     """Create the automation on the server, or make the one of its name as it should be."""
     wanted = automation or dead_run_automation()
     with get_client(sync_client=True) as client:
@@ -63,7 +65,10 @@ def provide_automation(automation: AutomationCore | None = None) -> Literal["cre
             client.create_automation(wanted)
             return "created"
         first, *more = known
-        client.update_automation(first.id, wanted)
+        # The server's has an identifier beside what was asked for.
+        changed = AutomationCore.model_validate(first.model_dump(exclude={"id"})) != wanted
+        if changed:
+            client.update_automation(first.id, wanted)
         for another in more:
             client.delete_automation(another.id)
-        return "updated"
+        return "updated" if changed or more else "unchanged"

@@ -16,7 +16,7 @@ from importlib import import_module
 
 from flows.commands.options import Parser
 from flows.interruption import interruptible
-from flows.printable import printable
+from flows.printable import in_one_line
 from flows.process_end import ProcessEnd
 from flows.standard_streams import output_refusal, set_up_streams, write_out
 
@@ -166,7 +166,7 @@ def _answered(arguments: Sequence[str]) -> int:
 def _say(line: str) -> None:
     """Tell on standard error; where that cannot be written, the exit code alone tells."""
     with suppress(OSError):
-        print(f"extrags: {printable(line)}", file=sys.stderr)
+        print(f"extrags: {in_one_line(line)}", file=sys.stderr)
     write_out()
 
 

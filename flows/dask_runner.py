@@ -26,13 +26,17 @@ from distributed.diagnostics.plugin import WorkerPlugin
 from prefect.settings import PREFECT_API_URL
 from prefect_dask import DaskTaskRunner
 
-from extrags.errors import ConfigError
+from extrags.errors import ConfigError, reason_of
 from tasks.machine import asks_for_gpu
 from tasks.page_choice import PAGE_VARIABLE
 
 __all__ = ["ClusterTaskRunner", "needed_resources"]
 
 log = logging.getLogger(__name__)
+
+# Importing it has set the level anew: each connection, and each stream that a client closes, would be told.
+if logging.getLogger("distributed").level == logging.INFO:
+    logging.getLogger("distributed").setLevel(logging.WARNING)
 
 PASSED_ON = (
     "PREFECT_API_URL",
@@ -101,7 +105,7 @@ class ClusterTaskRunner(DaskTaskRunner):  # type: ignore[misc]
             try:
                 self._client.unregister_worker_plugin(self._run)
             except Exception as error:
-                log.warning("the Dask workers were not told of the end: %s", error)
+                log.warning("the Dask workers were not told of the end: %s", reason_of(error))
         super().__exit__(*args)
 
     def threads_for(self, tasks: int) -> int | None:

@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Iterator
 from traceback import walk_tb
+from typing import Any
 
 from extrags.errors import ExtragsError
 
@@ -16,6 +17,9 @@ SUSPENDED = inspect.CO_COROUTINE | inspect.CO_ASYNC_GENERATOR
 """Kinds of functions that may have caught the exception and wait in an event loop for something else, as the
 clients of Prefect and Dask do: clearing their frames would end them. No stage is one."""
 
+REFUSED = (401, 403)
+"""Answers of HTTP to who may not ask."""
+
 SEE_TRACEBACK = "run again with --debug for the traceback"
 
 
@@ -23,12 +27,15 @@ def describe_error(error: BaseException) -> list[str]:
     """Describe an exception in one line, and a hint in a second line if there is one.
 
     An `ExtragsError` in the chain of causes is shown as its message, a connection error as an unreachable
-    server; any other exception by its type and message, with a hint to the traceback.
+    server, and a refusal of Prefect's server as one; any other exception by its type and message, with a hint
+    to the traceback.
     """
     for cause in _causes(error):
         if isinstance(cause, ExtragsError):
             return [_line(str(cause)), *getattr(cause, "__notes__", [])]
     for cause in _causes(error):
+        if _is_refused(cause):
+            return [_refusal(cause)]
         if is_connection_error(cause):
             return [f"a server went away or was never there: {_named(cause)}", _server_hint()]
     return [_named(error), SEE_TRACEBACK]
@@ -59,6 +66,23 @@ def is_connection_error(error: BaseException) -> bool:
     ]
     loaded = [getattr(sys.modules[module], name) for module, name in kinds if module in sys.modules]
     return isinstance(error, (ConnectionError, *loaded))
+
+
+def _is_refused(error: BaseException) -> bool:
+    """Whether Prefect's server does not take the user and password, or the key, that it was given."""
+    exceptions = sys.modules.get("prefect.exceptions")
+    if exceptions is None or not isinstance(error, exceptions.PrefectHTTPStatusError):
+        return False
+    return error.response.status_code in REFUSED
+
+
+def _refusal(error: Any) -> str:
+    where, answer = error.request.url.netloc.decode(), error.response
+    return (
+        f"the Prefect server at {where} refuses this command: {answer.status_code} {answer.reason_phrase}; "
+        "set PREFECT_API_AUTH_STRING to the USER:PASSWORD that it was started with, or PREFECT_API_KEY to "
+        "your key of Prefect Cloud"
+    )
 
 
 def release_locals(error: BaseException) -> None:

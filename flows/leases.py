@@ -45,6 +45,7 @@ from prefect.exceptions import ObjectNotFound
 from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY
 from prefect.states import Crashed
 
+from extrags.errors import reason_of
 from extrags.store import Store
 from extrags.store.runs import FORGOTTEN_DAYS
 
@@ -110,7 +111,8 @@ def run_lease(root: str) -> Iterator[None]:
                 # Removed while it is still locked: nobody finds it free.
                 (folder / _name(context.flow_run)).unlink(missing_ok=True)
             except OSError as error:
-                log.warning("the lease of this run stays: %s", error)
+                lease = folder / _name(context.flow_run)
+                log.warning("the lease of this run stays: %s: %s", lease, reason_of(error))
             finally:
                 os.close(descriptor)
 
@@ -293,7 +295,7 @@ def _take(folder: Path, run: FlowRun) -> int | None:
         os.write(descriptor, said.encode())
         part.rename(path)
     except OSError as error:
-        log.warning("this run has no lease: %s: %s", path, error.strerror or error)
+        log.warning("this run has no lease: %s: %s", path, reason_of(error))
         return None
     return descriptor
 

@@ -21,11 +21,12 @@ from rich.table import Table
 from rich.text import Text
 
 from extrags.config import DEFAULT_PROFILE, profile_config
+from extrags.errors import reason_of
 from extrags.stages import StageName, stages_until
 from extrags.store import Store
 from flows.estimate import RunEstimate, expected_seconds
 from flows.previews import stage_preview
-from flows.printable import printable
+from flows.printable import in_one_line
 from flows.terminal import TerminalConsole, console
 from tasks.progress import Pace, StageProgress, duration_text, observed, rate_text
 
@@ -253,7 +254,7 @@ class RunDisplay:
 
     def _stages(self, label: str, width: int) -> Text:
         """`phantom/11@sparse  ✓ ingest  - poses  ▸ coarse  · assess`, with breaks between stages alone."""
-        estimate, shown = self._estimate.in_work[label], printable(label)
+        estimate, shown = self._estimate.in_work[label], in_one_line(label)
         words, used = Text.assemble((shown, "bold")), cell_len(shown)
         for stage in stages_until(self._run.until):
             ended = estimate.ended.get(stage)
@@ -344,7 +345,7 @@ def _previews(store: Store) -> Iterator[Callable[[StageProgress, Callable[[str],
             try:
                 found = stage_preview(progress.label, progress.stage, progress.made, store)
             except Exception as error:
-                log.info("no picture of %s %s: %s", progress.label, progress.stage, error)
+                log.info("no picture of %s %s: %s", progress.label, progress.stage, reason_of(error))
                 continue
             if found is not None:
                 path, words = found

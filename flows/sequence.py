@@ -12,7 +12,7 @@ from pydantic import Field
 
 from data_catalog.names import plain_name
 from extrags.config import DEFAULT_PROFILE, ProfileName, Seed
-from extrags.errors import ExtragsError
+from extrags.errors import ExtragsError, reason_of
 from extrags.stages import StageName
 from extrags.store import Store
 from extrags.store.runs import file_killed, sweep_unreadable
@@ -137,5 +137,6 @@ def open_store(root: str) -> Store:
                 log.info("removed what a killed run left: %s", name)
         except Exception as error:
             # Leftovers take room and do no other harm. Each fsspec backend raises its own kinds.
-            log.warning("what killed runs left in %s could not all be removed: %s", root, error)
+            place = getattr(error, "filename", None) or root
+            log.warning("what killed runs left in %s could not all be removed: %s", place, reason_of(error))
     return store

@@ -9,6 +9,7 @@ from extrags.metrics.registry import Figure, figures, metric_named
 from extrags.pipeline import HELD_OUT_TRAINED_ON
 from flows.history import Judgement
 from flows.outcome import SequenceOutcome
+from flows.printable import in_one_line
 
 __all__ = [
     "benchmark_markdown",
@@ -59,7 +60,7 @@ def markdown_table(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
 
 
 def _cell(value: Any) -> str:
-    return str(value).replace("|", "\\|").replace("\n", " ")
+    return in_one_line(str(value)).replace("|", "\\|")
 
 
 def sequence_markdown(outcome: SequenceOutcome) -> str:
@@ -87,7 +88,7 @@ def sequence_markdown(outcome: SequenceOutcome) -> str:
         ],
     )
     where = f"Report: `{outcome.report}`" if outcome.report else "No report was made."
-    return f"## {outcome.name}: {outcome.status}\n\n{metrics}\n\n{stages}\n\n{where}\n"
+    return f"## {in_one_line(outcome.name)}: {outcome.status}\n\n{metrics}\n\n{stages}\n\n{where}\n"
 
 
 def dataset_markdown(outcomes: Sequence[SequenceOutcome]) -> str:

@@ -14,7 +14,7 @@ from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
-from flows.printable import printable
+from flows.printable import in_one_line, printable
 
 __all__ = ["TerminalConsole", "console", "print_table"]
 
@@ -48,8 +48,8 @@ class TerminalConsole(Console):
             self.turn.__exit__(kind, error, trace)
 
     def render_str(self, text: str, **options: Any) -> Text:
-        """As rich does."""
-        return super().render_str(printable(text), **options)
+        """As rich does, in one line: a line feed in a name would begin a row of a table that is none."""
+        return super().render_str(in_one_line(text), **options)
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
         """As rich does; here come texts that were put together elsewhere, too."""

@@ -103,9 +103,12 @@ def test_messages_hold_no_text_of_the_operating_system_as_python_puts_it() -> No
 
 def _bare_reasons(file: Path) -> Iterator[str]:
     for handler in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-        if not isinstance(handler, ast.ExceptHandler) or "OSError" not in ast.unparse(
-            handler.type or handler
-        ):
+        if not isinstance(handler, ast.ExceptHandler) or handler.type is None:
+            continue
+        caught = ast.unparse(handler.type)
+        if "OSError" in caught or caught == "Exception":
+            yield from (f"{file}:{line}" for line in _logged_bare(handler))
+        if "OSError" not in caught:
             continue
         for node in ast.walk(handler):
             if not isinstance(node, ast.Raise):
@@ -113,3 +116,12 @@ def _bare_reasons(file: Path) -> Iterator[str]:
             for part in ast.walk(node):
                 if isinstance(part, ast.FormattedValue) and ast.unparse(part.value) == handler.name:
                     yield f"{file}:{part.lineno}"
+
+
+def _logged_bare(handler: ast.ExceptHandler) -> Iterator[int]:
+    """Lines of messages that are given the error itself, without its kind before it."""
+    for node in ast.walk(handler):
+        if isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[0] in ("log", "logger", "_log"):
+            given = [ast.unparse(argument) for argument in node.args]
+            if handler.name in given and f"type({handler.name}).__name__" not in given:
+                yield node.lineno

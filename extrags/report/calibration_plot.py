@@ -6,9 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from extrags.errors import ConfigError, reason_of
-from extrags.output_files import whole_file
-from extrags.report.charts import METHOD_COLORS, QUIET, drawing_style, svg_image
+from extrags.errors import ConfigError
+from extrags.report.charts import METHOD_COLORS, QUIET, drawing_style, svg_image, write_figure
 from extrags.report.encode import DataImage
 
 __all__ = ["calibration_chart", "write_calibration_plot"]
@@ -38,13 +37,7 @@ def write_calibration_plot(curves: Mapping[str, Mapping[str, Any]], path: Path) 
         ConfigError: without any curve, or for a file that cannot be written.
     """
     with drawing_style():
-        figure = _drawn(curves)
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with whole_file(path) as partial:
-                figure.savefig(partial, dpi=150, facecolor="white")
-        except (OSError, ValueError) as error:
-            raise ConfigError(f"{path} cannot be written: {reason_of(error)}") from error
+        write_figure(_drawn(curves), path)
 
 
 def _drawn(curves: Mapping[str, Mapping[str, Any]]) -> Any:

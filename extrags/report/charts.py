@@ -6,6 +6,7 @@ Drawn by matplotlib without its global figure state, as SVG whose bytes depend o
 from __future__ import annotations
 
 import io
+import logging
 import re
 import textwrap
 import threading
@@ -14,11 +15,14 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from extrags.errors import ConfigError, reason_of
+from extrags.output_files import whole_file
 from extrags.report.chart_labels import drawable, row_labels
 from extrags.report.downloads import Cell, Chart, file_name
 from extrags.report.encode import data_uri
@@ -37,7 +41,10 @@ __all__ = [
     "sequences_chart",
     "svg_image",
     "views_chart",
+    "write_figure",
 ]
+
+logger = logging.getLogger(__name__)
 
 COARSE_COLOR = "#8794a3"
 FINAL_COLOR = "#0b6e75"
@@ -154,22 +161,53 @@ def svg_image(figure: Any) -> Chart:
     Text is outlines. Where no font of this machine has all of its letters, such as those of Chinese, it stays
     text, and whoever looks at the figure has it in a font of their own.
     """
+    buffer = io.StringIO()
+    with _with_all_letters(figure):
+        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None}, transparent=True)
+    text = _LONG_PATHS.sub(lambda path: _LONG_FRACTION.sub(r"\1", path.group()), buffer.getvalue())
+    text = text.replace(f"'{_FONT}'", f"'{_FONT}', sans-serif")
+    width, height = (round(float(inches) * 72) for inches in figure.get_size_inches())
+    return Chart(data_uri(text.encode("utf-8"), "image/svg+xml"), width, height)
+
+
+def write_figure(figure: Any, path: Path) -> None:
+    """A figure as an image file, whose letters are those of `svg_image`; call inside `drawing_style`.
+
+    Letters that no font of this machine has are boxes in all formats but SVG; a warning says so.
+
+    Args:
+        figure: to write.
+        path: its suffix (`.png`, `.svg`, `.pdf`) names the format.
+
+    Raises:
+        ConfigError: when it cannot be written.
+    """
+    # Without a date, so that the same numbers are the same file.
+    metadata = {"Date": None} if path.suffix == ".svg" else None
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with whole_file(path) as partial, _with_all_letters(figure) as there:
+            figure.savefig(partial, dpi=150, facecolor="white", metadata=metadata)
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path} cannot be written: {reason_of(error)}") from error
+    if not there and path.suffix != ".svg":
+        logger.warning("%s: no font here has all letters of its names, which an .svg would keep", path)
+
+
+@contextmanager
+def _with_all_letters(figure: Any) -> Iterator[bool]:
+    """Save a figure inside: as text where no font has all of its letters. Whether one has."""
     import matplotlib
     from matplotlib.text import Text
 
     for text in figure.findobj(Text):
         text.set_text(drawable(text.get_text()))
-    buffer = io.StringIO()
-    with warnings.catch_warnings():
-        as_text: Any = {"svg.fonttype": "none"} if _lacks_letters(figure) else {}
-        if as_text:
+    there = not _lacks_letters(figure)
+    as_text: Any = {} if there else {"svg.fonttype": "none"}
+    with warnings.catch_warnings(), matplotlib.rc_context(as_text):
+        if not there:
             warnings.filterwarnings("ignore", message="Glyph .* missing from font")
-        with matplotlib.rc_context(as_text):
-            figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None}, transparent=True)
-    text = _LONG_PATHS.sub(lambda path: _LONG_FRACTION.sub(r"\1", path.group()), buffer.getvalue())
-    text = text.replace(f"'{_FONT}'", f"'{_FONT}', sans-serif")
-    width, height = (round(float(inches) * 72) for inches in figure.get_size_inches())
-    return Chart(data_uri(text.encode("utf-8"), "image/svg+xml"), width, height)
+        yield there
 
 
 def history_chart(history: Mapping[str, Sequence[Mapping[str, Any]]]) -> Chart:

@@ -6,11 +6,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from extrags.errors import ConfigError, reason_of
+from extrags.errors import ConfigError
 from extrags.metrics.fronts import COSTS, SCENE
 from extrags.metrics.registry import figures
-from extrags.output_files import whole_file
-from extrags.report.charts import QUIET, drawing_style, method_marks, run_colors
+from extrags.report.charts import QUIET, drawing_style, method_marks, run_colors, write_figure
 
 __all__ = ["write_fronts_plot"]
 
@@ -81,14 +80,7 @@ def write_fronts_plot(
                 axes.set_xlim(left=0)
                 axes.grid(visible=True, axis="both")
         grid[0][0].legend()
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            # Without a date, so that the same numbers are the same file.
-            metadata = {"Date": None} if path.suffix == ".svg" else None
-            with whole_file(path) as partial:
-                figure.savefig(partial, dpi=150, facecolor="white", metadata=metadata)
-        except (OSError, ValueError) as error:
-            raise ConfigError(f"{path} cannot be written: {reason_of(error)}") from error
+        write_figure(figure, path)
 
 
 def _front(found: Sequence[Mapping[str, Any]], scene: tuple[Any, ...], cost: str, name: str) -> list[Any]:

@@ -41,6 +41,9 @@ _SMALLEST_SCALE, _LARGEST_SCALE = -10.0, 255 / 16 - 10
 _OUTSIDE_SHARE = 0.01
 """So many Gaussians may be of another size without a picture showing it much."""
 _LARGEST_COUNT = 10_000_000
+_MOST_FROM_A_BYTE = 1032
+"""Gzip unpacks a byte to no more: two bits stand for 258 bytes at most. Zstandard could to thousands of times
+as much, and a file of 20 kB fill gigabytes, but only with one number repeated: no scene is like that."""
 _QUAT_MAX = 511
 _COMPRESSION = 6
 """As the format's own tools have it. The highest level takes seven times as long for 0.6 % fewer bytes."""
@@ -157,6 +160,7 @@ def _gzipped(path: Path) -> _Planes:
                 raise _unknown_version(path, version)
             _check_header(path, n, degree, bits)
             sizes = _plane_sizes(version, degree)
+            _check_room(path, n, n * sum(sizes))
             # Not more than announced: a small file can unpack to anything.
             body = stream.read(n * sum(sizes))
     except (OSError, EOFError, zlib.error) as error:
@@ -175,6 +179,7 @@ def _streams(path: Path) -> _Planes:
         raise _unknown_version(path, header.version)
     _check_header(path, header.count, header.degree, header.bits)
     sizes = [header.count * size for size in _plane_sizes(4, header.degree)]
+    _check_room(path, header.count, sum(sizes))
     planes = [np.frombuffer(plane, dtype=np.uint8) for plane in read_planes(content, header, sizes, path)]
     return 4, header.count, header.degree, header.bits, planes
 
@@ -189,6 +194,18 @@ def _check_header(path: Path, count: int, degree: int, bits: int) -> None:
         raise SourceError(f"SH degree {degree}; expected 0 to 3", file=path, field="sh_degree")
     if count > _LARGEST_COUNT or bits > 24:
         raise SourceError(f"{count} Gaussians with {bits} fractional bits", file=path, field="count")
+
+
+def _check_room(path: Path, count: int, needed: int) -> None:
+    """Refuse, before memory is taken, a number of Gaussians that the file is too small for."""
+    there = path.stat().st_size
+    if needed > there * _MOST_FROM_A_BYTE:
+        raise SourceError(
+            f"{count} Gaussians of {needed} bytes announced in a file of {there}: truncated, or made to fill "
+            "the memory",
+            file=path,
+            field="count",
+        )
 
 
 def _unknown_version(path: Path, version: int) -> SourceError:

@@ -420,7 +420,7 @@ class Store:
             log.info("what the failed stage left for debugging: %s", kept)
         except OSError as problem:
             # A failure to keep debugging files must not hide the error of the stage.
-            log.warning("could not keep the debugging files of %s: %s", key, problem)
+            log.warning("could not keep the debugging files of %s in %s: %s", key, kept, reason_of(problem))
 
     def ls(self, pattern: str = "*") -> list[Manifest]:
         """Manifests of the artefacts whose key, stage, label or place matches a shell pattern, by age.

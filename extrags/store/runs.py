@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from extrags.errors import reason_of
 from extrags.store.artefacts import Store
 from extrags.store.canonical import digest_of
 from extrags.store.records import read_records, remove_record, write_record
@@ -106,7 +107,8 @@ class RunRecord:
                 try:
                     self._write()
                 except OSError as error:
-                    log.warning("the record of this run could not be written: %s", error)
+                    reason = reason_of(error)
+                    log.warning("the record %s of this run could not be written: %s", self._path, reason)
 
     def close(self) -> None:
         """The run has ended, well or not. The same artefacts again replace the record of the former run."""
@@ -156,7 +158,7 @@ def recorded_run(
     try:
         record = RunRecord(store, sequence, config, place)
     except OSError as error:
-        log.debug("no record of this run: %s", error)
+        log.debug("no record of this run in %s: %s", store.root, reason_of(error))
         yield None
         return
     try:
@@ -171,7 +173,7 @@ def recorded_run(
             record.close()
         except Exception as error:
             # Retention alone misses it; each fsspec backend raises its own kinds.
-            log.warning("the record of this run could not be written: %s", error)
+            log.warning("the record of this run could not be written: %s", reason_of(error))
 
 
 def active_runs(store: Store) -> list[Run]:

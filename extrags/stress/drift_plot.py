@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from extrags.errors import ConfigError, reason_of
-from extrags.output_files import whole_file
-from extrags.report.charts import METHOD_COLORS, drawing_style
+from extrags.report.charts import METHOD_COLORS, drawing_style, write_figure
 from extrags.stress.optimiser import Drift
 
 __all__ = ["write_drift_plot"]
@@ -47,9 +45,4 @@ def write_drift_plot(trainings: Mapping[str, Sequence[Drift]], path: Path) -> No
             panel.set_xlabel("iterations")
             panel.grid(visible=True, axis="both")
         panels[0].legend(loc="upper left")
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with whole_file(path) as partial:
-                figure.savefig(partial, dpi=150, facecolor="white")
-        except (OSError, ValueError) as error:
-            raise ConfigError(f"{path} cannot be written: {reason_of(error)}") from error
+        write_figure(figure, path)

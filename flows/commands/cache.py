@@ -14,7 +14,7 @@ from extrags.errors import ConfigError, DamagedArtefactError, StoreError
 from flows.commands.common import counted, existing_store, set_up_logging, write_json
 from flows.commands.options import Parser, add_json, add_store, add_verb
 from flows.commands.status import size_text
-from flows.printable import printable
+from flows.printable import in_one_line
 
 if TYPE_CHECKING:
     from extrags.store import Store
@@ -339,10 +339,10 @@ def gc(given: argparse.Namespace) -> int:
     leftovers, removed, skipped = cleaned.leftovers, cleaned.artefacts.removed, cleaned.artefacts.skipped
     if given.json != "-":
         for name in leftovers:
-            print(name)
+            print(in_one_line(name))
         for item in removed:
             said = f"{item.sequence}  {size_text(item.bytes)}  {item.reason}"
-            print(printable(f"artefacts/{item.key}  {said}"))
+            print(in_one_line(f"artefacts/{item.key}  {said}"))
         would = "would be " if given.dry_run else ""
         print(f"{counted(len(leftovers), 'leftover')} {would}removed from {store.root}")
         freed = size_text(sum(item.bytes for item in removed))

@@ -38,11 +38,12 @@ def leaderboard(given: argparse.Namespace) -> int:
     set_up_logging(debug=given.debug, terminal=True, quiet=given.quiet)
     store = existing_store(given)
     from extrags.report.leaderboard import build_leaderboard
-    from flows.recorded_runs import board_rows
+    from flows.recorded_runs import board_rows, nearest_on_record
 
     rows = board_rows(store, given.patterns, given.output)
     if not rows:
         wanted = f" of {', '.join(given.patterns)}" if given.patterns else ""
-        raise StoreError(f"no run{wanted} is on record in {store.root}")
+        near = nearest_on_record(store, given.patterns)
+        raise StoreError(f"no run{wanted} is on record in {store.root}{near}")
     print(write_page(build_leaderboard(rows, name=given.name), given.output))
     return 0

@@ -284,6 +284,7 @@ def add_method(parser: Parser) -> None:
     )
     parser.add_argument(
         "--method",
+        action=_Say,
         choices=tuple(METHODS),
         default=DEFAULT_METHOD,
         help="the whole pipeline (default), the coarse scene alone, plain 3DGS, ...",
@@ -348,6 +349,20 @@ def add_settings(parser: Parser, group: str = "") -> None:
         help="explain the settings of a group, or of all: values they take, and defaults of the profile",
     )
     parser.listing = _listing(known)
+
+
+class _Say(argparse.Action):
+    """Takes a value, as argparse does by itself, and keeps that it was given: it may be the default."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: Any,
+        option_string: str | None = None,
+    ) -> None:
+        setattr(namespace, self.dest, values)
+        setattr(namespace, f"said_{self.dest}", True)
 
 
 class _Assign(argparse.Action):

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import argparse
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from extrags.errors import CaptureError, ConfigError, WeightsError, reason_of
+from extrags.errors import CaptureError, ConfigError, reason_of
 from flows.commands.common import is_terminal, set_up_logging, showing, training_settings
 from flows.commands.options import Parser, add_output
 from flows.commands.outputs import output_folder
+from flows.commands.pretrain_folder import CHECKPOINT, check_weights_there, sole_training
 from flows.commands.pretrain_scenes import SOURCES, make_scenes, scene_sources
 from flows.interruption import say_when_interrupted
 
@@ -20,7 +23,6 @@ if TYPE_CHECKING:
 __all__ = ["add_arguments", "pretrain"]
 
 
-CHECKPOINT = "checkpoint.safetensors"
 OF_DRAWING = (
     *("drawn_share", "drawn_perceptual_weight", "adversarial_weight", "adversary_rate"),
     *("patches", "patch_px"),
@@ -236,7 +238,7 @@ def pretrain(given: argparse.Namespace) -> int:
             check_sizes(config, [(scene.height, scene.width) for scene in trained_on])
     # As things are now: in some hours the working tree may be another.
     about: dict[str, Any] = {"command": _command(given), "machine": machine()}
-    with progress_display(showing(given)), reporting("restorer", "pretrain"):
+    with _alone(given), progress_display(showing(given)), reporting("restorer", "pretrain"):
         folder = Path(given.scenes_folder)
         if isinstance(config, HiddenDepthConfig):
             files = make_examples(folder, sources, begun, given.workers)
@@ -311,6 +313,23 @@ def for_scenes(config: PretrainingConfig, made: int) -> PretrainingConfig:
     )
 
 
+@contextmanager
+def _alone(given: argparse.Namespace) -> Iterator[None]:
+    """No other training writes where this one does."""
+    if given.scenes_only:
+        yield
+        return
+    with sole_training(Path(given.output)):
+        # Another may have ended since they were looked at.
+        _check_weights_there(given)
+        yield
+
+
+def _check_weights_there(given: argparse.Namespace) -> None:
+    if given.output is not None and not (given.scenes_only or given.hidden_depth):
+        check_weights_there(Path(given.output), "refiner" if given.refiner else "embedded")
+
+
 def _told(record: dict[str, Any], folder: str) -> int:
     from flows.terminal import console
 
@@ -350,8 +369,7 @@ def checked(given: argparse.Namespace, scenes: int, validation_scenes: int, *, p
         raise ConfigError(f"--exact-share {given.exact_share}: expected a number from 0 to 1")
     if given.output is None and not given.scenes_only:
         raise ConfigError("--output: where do the weights go? (--scenes-only makes scenes alone)")
-    if given.output is not None and not (given.scenes_only or given.hidden_depth):
-        check_weights_there(Path(given.output), "refiner" if given.refiner else "embedded")
+    _check_weights_there(given)
     if given.real_textures:
         from data_catalog.cavities.real_textures import texture_files
 
@@ -365,40 +383,6 @@ def checked(given: argparse.Namespace, scenes: int, validation_scenes: int, *, p
             Path(folder).mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise ConfigError(f"{folder} cannot be written: {reason_of(error)}") from error
-
-
-def check_weights_there(folder: Path, backend: str) -> None:
-    """Refuse a folder whose weights would be lost.
-
-    The descriptions of restorers and refiners have one name: the one that is written last is the only one.
-    A restorer's training goes on in its folder from its checkpoint, which is gone once all steps are made:
-    who asks for more steps then would get weights that are trained anew.
-
-    Args:
-        folder: where weights go; need not be there.
-        backend: what they are of, as their description says.
-
-    Raises:
-        ConfigError: when the folder holds the description of another kind of weights, or a restorer without a
-            checkpoint.
-    """
-    from extrags.restoration.description import DESCRIPTION, read_description
-
-    try:
-        found = read_description(folder / DESCRIPTION).get("backend")
-    except WeightsError:
-        # None there, or one that nothing can read: no weights would be lost.
-        return
-    if found != backend:
-        raise ConfigError(
-            f"--output {folder}: {DESCRIPTION} there describes other weights (backend {found}), and would be "
-            f"overwritten by that of these ({backend}); take another folder"
-        )
-    if backend == "embedded" and not (folder / CHECKPOINT).is_file():
-        raise ConfigError(
-            f"--output {folder}: a finished restorer is there, and no checkpoint to go on from; take another "
-            f"folder, with --start {folder} to train it further, or remove {DESCRIPTION} to overwrite it"
-        )
 
 
 def _command(given: argparse.Namespace) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from extrags.errors import CaptureError, ConfigError, DivergedError, ExtragsError
 from flows.commands.common import training_settings, write_json
-from flows.commands.pretrain_scenes import in_processes
+from flows.commands.pretrain_scenes import make_missing
 
 if TYPE_CHECKING:
     from extrags.depth.completion import CompletionNetwork
@@ -21,8 +20,6 @@ if TYPE_CHECKING:
     from flows.commands.pretrain_scenes import SceneSource
 
 __all__ = ["Beginning", "beginning", "hidden_depth_settings", "make_examples", "make_views", "trained_reader"]
-
-logger = logging.getLogger(__name__)
 
 FOLDER = "hidden_depth"
 """Where the examples are kept, beside the scenes of the other trainings."""
@@ -94,7 +91,7 @@ def beginning(restorer: str, completion: str) -> Beginning:
 
 
 def make_examples(folder: Path, sources: Sequence[SceneSource], begun: Beginning, workers: int) -> list[Path]:
-    """Restored virtual views of pretraining scenes as files; those made in the same way stay.
+    """Restored virtual views of pretraining scenes as files, made and kept as `make_scenes` does scenes.
 
     Args:
         folder: of the pretraining scenes.
@@ -103,26 +100,16 @@ def make_examples(folder: Path, sources: Sequence[SceneSource], begun: Beginning
         workers: processes at once.
 
     Returns:
-        Files of the scenes that could be explored.
+        Files of the scenes that could be explored; a warning names each of the others.
     """
-    from extrags.restoration.training_data.pretraining_scenes import PretrainingScene
-
-    digest = begun.restorer_digest
-    origins = {folder / FOLDER / source.file_name: origin_of(source, digest) for source in sources}
-    jobs = [
-        partial(make_views, source, file, begun.restorer, origin)
-        for source, (file, origin) in zip(sources, origins.items(), strict=True)
-        if PretrainingScene.made_from(file) != origin
-    ]
-    in_processes(jobs, workers, "pretraining-views", done=len(sources) - len(jobs))
-    found = []
-    for file, origin in origins.items():
-        if PretrainingScene.made_from(file) == origin:
-            found.append(file)
-        else:
-            # Told here: what a process of its own logs goes past the progress bar.
-            logger.warning("%s: left out, it could not be reconstructed or explored", file.stem)
-    return found
+    by_file = {folder / FOLDER / source.file_name: source for source in sources}
+    origins = {file: origin_of(source, begun.restorer_digest) for file, source in by_file.items()}
+    return make_missing(
+        origins,
+        lambda file: partial(make_views, by_file[file], file, begun.restorer, origins[file]),
+        workers,
+        "pretraining-views",
+    )
 
 
 def origin_of(source: SceneSource, digest: str) -> str:
@@ -143,14 +130,17 @@ def origin_of(source: SceneSource, digest: str) -> str:
     return json.dumps(parts, sort_keys=True)
 
 
-def make_views(source: SceneSource, file: Path, restorer: str, origin: str) -> None:
-    """The examples of one scene; none where it cannot be reconstructed, or there is nothing to explore.
+def make_views(source: SceneSource, file: Path, restorer: str, origin: str) -> str | None:
+    """The examples of one scene.
 
     Args:
         source: of the scene.
         file: where they go.
         restorer: a folder with weights, or a set of the package's.
         origin: what they are made from.
+
+    Returns:
+        Why there are none, where it cannot be reconstructed, or there is nothing to explore; else None.
     """
     from extrags.config import profile_config
     from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
@@ -161,9 +151,10 @@ def make_views(source: SceneSource, file: Path, restorer: str, origin: str) -> N
     try:
         recording = source.recording(to_restore=False)
         made = HiddenDepthExamples.of_recording(recording, enhancer, profile_config("quick"), source.seed)
-    except (CaptureError, DivergedError):
-        return
+    except (CaptureError, DivergedError) as error:
+        return str(error)
     made.save(file, origin=origin)
+    return None
 
 
 def trained_reader(

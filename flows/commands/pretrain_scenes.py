@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from functools import partial
@@ -22,7 +22,15 @@ if TYPE_CHECKING:
     from data_catalog.phantom.config import PhantomConfig
     from extrags.restoration.training_data.recordings import PretrainingRecording
 
-__all__ = ["SOURCES", "SceneSource", "in_processes", "make_scene", "make_scenes", "scene_sources"]
+__all__ = [
+    "SOURCES",
+    "SceneSource",
+    "in_processes",
+    "make_missing",
+    "make_scene",
+    "make_scenes",
+    "scene_sources",
+]
 
 Result = TypeVar("Result")
 
@@ -148,50 +156,76 @@ def make_scenes(folder: Path, sources: Sequence[SceneSource], workers: int) -> l
     Returns:
         Files of the scenes that could be made; a warning names each of the others.
     """
+    by_file = {folder / source.file_name: source for source in sources}
+    return make_missing(
+        {file: source.origin for file, source in by_file.items()},
+        lambda file: partial(make_scene, by_file[file], file),
+        workers,
+        "pretraining-scenes",
+    )
+
+
+def make_missing(
+    origins: Mapping[Path, str],
+    job_of: Callable[[Path], Callable[[], str | None]],
+    workers: int,
+    told_as: str,
+) -> list[Path]:
+    """Files of scenes, or of examples from them, as `make_scenes` makes and keeps them.
+
+    Args:
+        origins: what each file is to be made from.
+        job_of: what makes a file, and gives the reason where it cannot; can be pickled.
+        workers: processes at once.
+        told_as: named in progress events.
+
+    Returns:
+        Files that could be made; a warning names each of the others.
+    """
     from extrags.restoration.training_data.pretraining_scenes import PretrainingScene
 
-    files = [folder / source.file_name for source in sources]
     missing, failed = [], {}
-    for source, file in zip(sources, files, strict=True):
-        if PretrainingScene.made_from(file) == source.origin:
+    for file, origin in origins.items():
+        if PretrainingScene.made_from(file) == origin:
             continue
-        reason = _recorded_failure(source, file)
+        reason = _recorded_failure(file, origin)
         if reason is None:
-            missing.append((source, file))
+            missing.append(file)
         else:
-            record = _failure_file(file)
-            failed[file] = f"{reason} (an earlier attempt of this version, {record}; remove it to try again)"
-    jobs = [partial(make_scene, source, file) for source, file in missing]
-    reasons = in_processes(jobs, workers, "pretraining-scenes", done=len(files) - len(missing))
-    for (source, file), new in zip(missing, reasons, strict=True):
+            kept = _failure_file(file)
+            failed[file] = f"{reason} (an earlier attempt of this version, {kept}; remove it to try again)"
+    jobs = [job_of(file) for file in missing]
+    reasons = in_processes(jobs, workers, told_as, done=len(origins) - len(missing))
+    for file, new in zip(missing, reasons, strict=True):
         if new is None:
             _failure_file(file).unlink(missing_ok=True)
         else:
             failed[file] = new
-            folder.mkdir(parents=True, exist_ok=True)
-            write_file(_failure_file(file), json.dumps({**_attempt(source), "reason": new}, indent=1) + "\n")
+            file.parent.mkdir(parents=True, exist_ok=True)
+            record = {**_attempt(origins[file]), "reason": new}
+            write_file(_failure_file(file), json.dumps(record, indent=1) + "\n")
     for file, reason in failed.items():
         # Told here: what a process of its own logs goes past the progress bar.
         logger.warning("%s: left out, %s", file.stem, reason)
-    return [file for file in files if file not in failed]
+    return [file for file in origins if file not in failed]
 
 
 def _failure_file(file: Path) -> Path:
     return file.with_suffix(".failed.json")
 
 
-def _attempt(source: SceneSource) -> dict[str, str]:
-    """What decides whether a scene can be made; the version stands for the code of its reconstruction."""
-    return {"extrags": f"{__version__} {source_commit() or ''}".strip(), "origin": source.origin}
+def _attempt(origin: str) -> dict[str, str]:
+    """What decides whether a file can be made; the version stands for the code of its reconstruction."""
+    return {"extrags": f"{__version__} {source_commit() or ''}".strip(), "origin": origin}
 
 
-def _recorded_failure(source: SceneSource, file: Path) -> str | None:
-    """Why an earlier attempt at the same scene failed; None where there was none, or it was another."""
+def _recorded_failure(file: Path, origin: str) -> str | None:
+    """Why an earlier attempt at the same file failed; None where there was none, or it was another."""
     try:
         record = json.loads(_failure_file(file).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    same = isinstance(record, dict) and all(record.get(key) == told for key, told in _attempt(source).items())
+    same = isinstance(record, dict) and all(record.get(key) == told for key, told in _attempt(origin).items())
     return str(record["reason"]) if same and "reason" in record else None
 
 

@@ -8,7 +8,7 @@ import time
 from extrags.errors import ConfigError
 from flows.commands.common import set_up_logging, store_root
 from flows.commands.options import Parser, add_store
-from flows.printable import printable
+from flows.printable import in_one_line
 
 __all__ = ["add_arguments", "reconcile"]
 
@@ -48,7 +48,7 @@ def reconcile(given: argparse.Namespace) -> int:
         more, missing = settle_dead_runs(root, frozenset(missing))
         settled += more
     for run in settled:
-        print(f"{printable(run.name)} ({run.id}): Crashed")
+        print(f"{in_one_line(run.name)} ({run.id}): Crashed")
     for run_id in sorted(missing, key=str):
         print(f"{run_id}: misses its heartbeats; --wait looks again")
     if not settled and not missing:

@@ -28,7 +28,6 @@ from flows.commands.common import (
     write_json,
 )
 from flows.commands.options import (
-    DEFAULT_METHOD,
     Parser,
     add_json,
     add_method,
@@ -41,7 +40,7 @@ from flows.commands.run_checks import check_names, check_working_distance, wrong
 from flows.failures import describe_error
 from flows.interruption import RESUMABLE, say_when_interrupted
 from flows.outcome import DatasetFailedError, DatasetOutcome, SequenceOutcome, failed_outcome
-from flows.printable import printable
+from flows.printable import in_one_line
 
 if TYPE_CHECKING:
     from extrags.stages import StageName
@@ -121,8 +120,12 @@ def run(given: argparse.Namespace) -> int:
         )
     if given.seeds and given.seed is not None:
         raise ConfigError("--seeds stands in place of --seed: give one of the two")
-    if given.methods and given.method != DEFAULT_METHOD:
+    if given.methods and getattr(given, "said_method", False):
         raise ConfigError("--methods stands in place of --method: give one of the two")
+    matrix = parsed_matrix(given.matrix)
+    for name in matrix:
+        if name in getattr(given, "said_settings", {}):
+            raise ConfigError(f"--matrix {name} stands in place of --{name} and --set: give one of them")
     begun = time.monotonic()
     outcome = execute(
         sequences,
@@ -135,7 +138,7 @@ def run(given: argparse.Namespace) -> int:
             only=given.only,
             methods=tuple(parsed_methods(given.methods, given.method)),
             seeds=tuple(parsed_seeds(given.seeds) if given.seeds else [given.seed]),
-            matrix=parsed_matrix(given.matrix),
+            matrix=matrix,
         ),
     )
     seconds = time.monotonic() - begun
@@ -149,7 +152,7 @@ def run(given: argparse.Namespace) -> int:
         print_outcomes(outcome, seconds)
     errors = [sequence.error for sequence in outcome.sequences if sequence.error is not None]
     for hint in dict.fromkeys(hint for error in errors for hint in describe_error(error)[1:]):
-        print(f"extrags: {printable(hint)}", file=sys.stderr)
+        print(f"extrags: {in_one_line(hint)}", file=sys.stderr)
     write_json(outcome.to_json(seconds), given.json)
     return 0 if all(sequence.status == "ok" for sequence in outcome.sequences) else 1
 

@@ -11,7 +11,7 @@ from extrags.user_paths import expanded
 from flows.commands.common import finished_run, run_config, set_up_logging
 from flows.commands.options import Parser, add_method
 from flows.interruption import until_told_to_stop
-from flows.printable import printable
+from flows.printable import in_one_line
 
 if TYPE_CHECKING:
     import numpy as np
@@ -97,7 +97,7 @@ def view(given: argparse.Namespace) -> int:
     )
     where = "gsplat on CUDA" if device == "cuda" else f"native kernels ({native_isa()})"
     print(
-        f"{server.url}: {printable(shown.name)}, {len(shown.scene.gaussians)} Gaussians, {where}; "
+        f"{server.url}: {in_one_line(shown.name)}, {len(shown.scene.gaussians)} Gaussians, {where}; "
         "Ctrl-C ends",
         flush=True,
     )

@@ -69,6 +69,13 @@ def test_vertices_are_not_read_number_by_number(tmp_path: Path) -> None:
     assert np.array_equal(found["y"], rows["y"])
 
 
+def test_a_ply_whose_negative_count_hides_a_large_one(tmp_path: Path) -> None:
+    head = "element vertex 3000000000\nproperty float x\nelement face -2999999999\nproperty float y\n"
+    (tmp_path / "a.ply").write_text(f"ply\nformat ascii 1.0\n{head}end_header\n0\n")
+    with pytest.raises(ValueError, match=r"^-2999999999 elements announced"):
+        load_ply_vertices(tmp_path / "a.ply")
+
+
 def test_an_archive_that_would_fill_the_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / "a.npz"
     np.savez_compressed(file, a=np.zeros((1000, 1000)))

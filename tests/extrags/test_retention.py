@@ -431,7 +431,7 @@ def test_a_disk_that_is_full_in_the_middle_ends_no_run_and_keeps_the_record(
         record.add(f"coarse-v1-{number:032d}" for number in range(20))
         (run,) = active_runs(store)
         assert run.keys == {"ingest-v1-00"}
-        assert "could not be written: [Errno 28]" in caplog.text
+        assert "could not be written: No space left on device" in caplog.text
     (ended,) = runs_of(store)
     assert len(ended.keys) == 21
 

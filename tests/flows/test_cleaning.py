@@ -111,10 +111,21 @@ def test_the_command_says_so_as_well(store: Store, capsys: pytest.CaptureFixture
 
 
 @pytest.mark.parametrize("name", ["older_than_days", "max_gib", "flow_runs_days"])
-@pytest.mark.parametrize("value", [float("inf"), float("nan"), 1e308])
+@pytest.mark.parametrize("value", [float("inf"), float("nan"), 1e308, -1.0])
 def test_numbers_without_bounds_are_refused(name: str, value: float) -> None:
     with pytest.raises(ParameterTypeError, match=f"{name}: Input should be"):
         retention.validate_parameters({"store": "somewhere", name: value})
+
+
+@pytest.mark.usefixtures("untouched_environment")
+@pytest.mark.parametrize(
+    "option", ["--older-than=-30d", "--older-than=30", "--max-size=-1GiB", "--keep-last=-1"]
+)
+def test_ages_and_sizes_below_zero_are_refused(option: str, store: Store) -> None:
+    """Everything is older than that."""
+    before = store.keys()
+    assert main(["cache", "gc", option, "--store", store.root]) == 2
+    assert store.keys() == before
 
 
 @pytest.mark.usefixtures("untouched_environment")

@@ -193,6 +193,11 @@ class TestUsage:
             ([SEQUENCE, "--help-settings", "coarse.lght"], "did you mean coarse.light?"),
             ([SEQUENCE, "--seed", "1", "--seeds", "2"], "--seeds stands in place of --seed"),
             ([SEQUENCE, "--method", "coarse", "--methods", "3dgs"], "--methods stands in place of --method"),
+            ([SEQUENCE, "--method", "extrags", "--methods", "3dgs"], "--methods stands in place of --method"),
+            (
+                [SEQUENCE, "--matrix", "coarse.iterations=5,6", "--coarse.iterations", "7"],
+                "--matrix coarse.iterations stands in place of --coarse.iterations",
+            ),
             ([SEQUENCE, "--store", ""], "argument --store: expected a folder or a URL"),
             ([SEQUENCE, "--at-once", "0"], "--at-once is 0"),
             ([SEQUENCE, SEQUENCE], "named twice"),

@@ -122,6 +122,7 @@ class TestLimits:
             ("--retries", "few", "a whole number from 0 to 10"),
             ("--stage-time-limit", "0", "a finite number above 0"),
             ("--stage-time-limit", "nan", "a finite number above 0"),
+            ("--stage-time-limit", "-5", "a finite number above 0"),
             ("--stage-time-limit", "inf", "a finite number above 0"),
         ],
     )

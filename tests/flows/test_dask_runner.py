@@ -91,6 +91,22 @@ def test_kernel_threads_are_never_more_than_cores(tasks: int, at_once: int, thre
     assert ClusterTaskRunner("tcp://127.0.0.1:1", 8).threads_for(tasks) is None
 
 
+def test_messages_of_dask_are_those_of_something_wrong() -> None:
+    """Its import sets levels of its own, by which each stream that is closed was told."""
+    code = (
+        "import logging\n"
+        "from flows.commands.common import set_up_logging\n"
+        "set_up_logging(debug=False, terminal=False)\n"
+        "import flows.dask_runner\n"
+        "log = logging.getLogger('distributed.core')\n"
+        "log.info(\"Received 'close-stream' from %s; closing.\", 'tcp://127.0.0.1:1')\n"
+        "log.error('a task failed')\n"
+    )
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stderr
+    assert "close-stream" not in said
+    assert "a task failed" in said
+
+
 def test_runners_by_name() -> None:
     assert isinstance(task_runner("dask"), ClusterTaskRunner)
     assert task_runner("dask:tcp://127.0.0.1:8786").address == "tcp://127.0.0.1:8786"

@@ -188,6 +188,9 @@ DAY_S = 86400.0
         (None, True, 0, True),
         (None, False, 31, False),
         (None, True, 31, False),
+        # A clock was ahead, here or there: how old it is, nobody knows.
+        (None, False, -400, True),
+        (Completed(), False, -400, False),
     ],
     ids=lambda value: value.name if isinstance(value, State) else str(value),
 )
@@ -232,6 +235,7 @@ def test_leases_of_runs_that_ended_go_wherever_they_ran(
     ("name", "content", "days", "held", "kept"),
     [
         ("a.part", '{"flow_run": "', 31, False, False),
+        ("a.part", '{"flow_run": "', -400, False, True),
         ("a.part", '{"flow_run": "', 29, False, True),
         ("a.part", '{"flow_run": "', 31, True, True),
         ("a.lease", "", 31, False, False),
@@ -294,7 +298,8 @@ def test_a_store_that_is_gone_at_the_end_fails_no_run(
         run_lease(str(tmp_path)),
     ):
         patched.setattr(Path, "unlink", gone)
-    assert "the lease of this run stays: [Errno 116]" in caplog.text
+    (lease,) = (Store(tmp_path).state / "leases").iterdir()
+    assert f"the lease of this run stays: {lease}: {os.strerror(errno.ESTALE)}" in caplog.text
     assert len(os.listdir("/proc/self/fd")) == before
 
 
@@ -305,6 +310,7 @@ def test_outside_a_run_there_is_no_lease(tmp_path: Path) -> None:
 
 def test_the_automation_is_made_once() -> None:
     assert provide_automation() == "created"
+    assert provide_automation() == "unchanged"
     assert provide_automation(dead_run_automation(3600)) == "updated"
     with get_client(sync_client=True) as client:
         (automation,) = client.read_automations_by_name(NAME)

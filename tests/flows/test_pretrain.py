@@ -1,7 +1,11 @@
 from __future__ import annotations
 
+import errno
 import json
+import os
 import shlex
+import subprocess
+import sys
 from argparse import Namespace
 from dataclasses import replace
 from importlib.resources import files
@@ -32,6 +36,7 @@ from flows.cli import main
 from flows.commands import pretrain_scenes
 from flows.commands.options import Parser
 from flows.commands.pretrain import _settings, add_arguments, for_scenes
+from flows.commands.pretrain_folder import sole_training
 from flows.commands.pretrain_refiner import examples_of, start_of_refiner
 from flows.commands.pretrain_scenes import SceneSource, make_scenes, scene_sources
 from tests.extrags.random_lpips import random_weights
@@ -278,6 +283,46 @@ def test_any_setting_can_be_given_and_an_ended_training_goes_on(
     assert "drawn_share" in capsys.readouterr().err
     assert main([*given, "--set", "most_seconds=-1"]) == 2
     assert "most_seconds" in capsys.readouterr().err
+
+
+def test_two_trainings_do_not_write_into_one_folder(
+    scenes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Each went on from, and wrote over, the checkpoint of the other. One that was killed is no hindrance."""
+    given = ["pretrain", "--output", str(tmp_path / "w"), "--scenes-folder", str(scenes), "--scenes", "3"]
+    given += ["--validation-scenes", "1", "--batch", "1", "--without-perceptual", "--threads", "1"]
+    given += ["--set", "channels=8,16,16", "--iterations", "1"]
+    (tmp_path / "w").mkdir()
+    code = (
+        "import sys, time; from pathlib import Path\n"
+        "from flows.commands.pretrain_folder import sole_training\n"
+        "with sole_training(Path(sys.argv[1])): print('has it', flush=True); time.sleep(600)"
+    )
+    command = [sys.executable, "-c", code, str(tmp_path / "w")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as other:
+        try:
+            assert other.stdout is not None
+            assert other.stdout.readline() == "has it\n"
+            assert main(given) == 2
+            said = capsys.readouterr().err
+            assert f"--output {tmp_path / 'w'}: another training writes there now" in said
+            # Scenes alone write nothing there.
+            assert main([*given, "--scenes-only"]) == 0
+        finally:
+            other.kill()
+    assert main(given) == 0
+    assert {file.name for file in (tmp_path / "w").iterdir()} == {"restorer.json", "restorer.safetensors"}
+
+
+def test_a_folder_that_cannot_be_locked_is_trained_in(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def without_locks(*_given: object) -> None:
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr("tasks.locks.fcntl.flock", without_locks)
+    with sole_training(tmp_path):
+        assert "cannot be locked against a second training: No locks available" in caplog.text
 
 
 def test_finished_weights_are_not_overwritten(
@@ -550,8 +595,17 @@ class TestHiddenDepth:
         CompletionNetwork().load_state_dict({name: value.float() for name, value in weights.items()})
         # Whoever may read the record may read the weights.
         assert (out / "hidden.safetensors").stat().st_mode == (out / "hidden.json").stat().st_mode
-        # What could be explored is kept.
+        # What could be explored is kept, and why the other could not.
+        caplog.clear()
         assert main([*given, "--output", str(tmp_path / "again")]) == 0
+        assert made[3:] == []
+        failure = tmp_path / "scenes" / "hidden_depth" / "cavities_00000.failed.json"
+        assert (
+            f"cavities_00000: left out, nothing to explore (an earlier attempt of this version, {failure}"
+            in (caplog.text)
+        )
+        monkeypatch.setattr(pretrain_scenes, "__version__", "another")
+        assert main([*given, "--output", str(tmp_path / "later")]) == 0
         assert made[3:] == ["cavities 0"]
 
     def test_wrong_settings_are_named(

@@ -133,6 +133,14 @@ def test_names_say_what_differs(traits: list[dict[str, str]], names: list[str]) 
     assert run_names([Traits(**own) for own in traits]) == names
 
 
+@pytest.mark.parametrize("verb", ["leaderboard", "gallery", "compare"])
+def test_a_misspelt_sequence_is_answered_with_the_nearest(
+    verb: str, store: Store, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([verb, SEQUENCE.replace("phantom", "phamtom"), "--store", store.root]) != 0
+    assert f"; did you mean {SEQUENCE}?" in capsys.readouterr().err
+
+
 def test_rows_of_the_leaderboard(store: Store) -> None:
     rows = board_rows(store)
     assert [(row.method, row.status) for row in rows] == [

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -72,6 +74,30 @@ def test_what_is_being_made(store: Store) -> None:
     with store.slot(stage="ingest", version=1, key="ingest-v1-x", label="phantom/3@sparse"):
         rows = store_status(store).rows
         assert [(row.sequence, row.state) for row in rows][1] == ("phantom/3@sparse", "running")
+
+
+def test_what_another_process_makes(store: Store) -> None:
+    """However that process ends."""
+    code = (
+        "import sys, time\n"
+        "from extrags.store import Store\n"
+        "from extrags.store.runs import recorded_run\n"
+        "store = Store(sys.argv[1])\n"
+        "slot = store.slot(stage='ingest', version=1, key='ingest-v1-x', label='phantom/3@sparse')\n"
+        "with recorded_run(store, 'phantom/3@sparse'), slot:\n"
+        "    print('makes it', flush=True)\n"
+        "    time.sleep(600)\n"
+    )
+    command = [sys.executable, "-c", code, store.root]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as other:
+        try:
+            assert other.stdout is not None
+            assert other.stdout.readline() == "makes it\n"
+            states = {row.sequence: row.state for row in store_status(store).rows}
+            assert states == {SEQUENCE: "done", "phantom/3@sparse": "running"}
+        finally:
+            other.kill()
+    assert "running" not in {row.state for row in store_status(store).rows}
 
 
 def half_a_run(store: Store, finished: tuple[str, SequenceOutcome]) -> set[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import logging
 from argparse import Namespace
+from pathlib import PurePosixPath
 from types import SimpleNamespace
 
 import pytest
@@ -13,9 +14,11 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
+from extrags.errors import SourceError
 from flows.cli import main
 from flows.commands.common import StandardErrorHandler, showing
 from flows.printable import PrintableFormatter, printable
+from flows.tables import markdown_table
 from flows.terminal import console, print_table
 
 EVIL = "a\x1b]0;title\x07\x1b[2J\x9b1A\r\u202eb"
@@ -65,6 +68,40 @@ def test_in_errors(capsys: pytest.CaptureFixture[str]) -> None:
 def test_in_the_log() -> None:
     record = logging.makeLogRecord({"msg": "frame %s\n  of", "args": (EVIL,)})
     assert PrintableFormatter("%(message)s").format(record) == f"frame {SHOWN}\n  of"
+
+
+BROKEN = "scan\n1\rof 2"
+"""Folders can be called so."""
+
+
+def test_a_name_with_line_breaks_stays_in_its_row(monkeypatch: pytest.MonkeyPatch) -> None:
+    out = console()
+    monkeypatch.setattr(out, "file", io.StringIO())
+    table = Table("name", "next", box=None)
+    table.add_row(escape(BROKEN), "ok")
+    print_table(out, table)
+    out.print(f"{BROKEN}: failed", markup=False)
+    heads, row, line = out.file.getvalue().splitlines()  # type: ignore[attr-defined]
+    assert heads.split() == ["name", "next"]
+    assert row.split("  ")[0].strip() == r"scan\n1\rof 2"
+    assert line == r"scan\n1\rof 2: failed"
+
+
+def test_a_name_with_line_breaks_stays_in_its_row_of_a_page() -> None:
+    assert markdown_table(["name"], [[BROKEN]]).splitlines()[2:] == [r"| scan\n1\rof 2 |"]
+
+
+@pytest.mark.parametrize("given", [BROKEN, PurePosixPath(BROKEN), SourceError("no", file=BROKEN)])
+def test_a_name_with_line_breaks_stays_in_its_line_of_the_log(given: object) -> None:
+    record = logging.makeLogRecord({"msg": "%s: %d frames", "args": (given, 3)})
+    (line,) = PrintableFormatter("%(message)s").format(record).splitlines()
+    assert r"scan\n1\rof 2" in line
+    assert record.args == (given, 3)
+
+
+def test_a_name_with_line_breaks_stays_in_its_line_of_errors(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["data", "validate", BROKEN]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
 
 
 def test_the_log_goes_where_standard_error_goes_at_the_time(monkeypatch: pytest.MonkeyPatch) -> None:

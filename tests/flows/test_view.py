@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import importlib.util
 import json
+import shutil
 import socket
 import sys
 import threading
@@ -224,6 +225,35 @@ class TestServed:
         assert main([*arguments, "--scene", which, "--port", "0", "--device", "cpu"]) == 0
         expected = Store(store).load(Scene, outcome.refs[stage])
         torch.testing.assert_close(shown[0].gaussians.means, expected.gaussians.means)
+
+    @pytest.mark.usefixtures("stand_in")
+    def test_a_scene_whose_artefact_goes_meanwhile_is_shown_to_its_end(
+        self,
+        finished: Finished,
+        shown: list[Scene],
+        tmp_path: Path,
+        monkeypatch: pytest.MonkeyPatch,
+        capsys: pytest.CaptureFixture[str],
+    ) -> None:
+        """It is in memory; who asks for it later is told that it is not in the store."""
+        root, outcome = finished
+        keys = {key for row in outcome.stages for key in row.made}
+        for key in keys:
+            shutil.copytree(Path(root) / "artefacts" / key, tmp_path / "store" / "artefacts" / key)
+        store, pictures = Store(tmp_path / "store"), []
+
+        def removed() -> None:
+            store.rm("finetune*")
+            scene = shown[0]
+            pictures.append(scene.render(build_tube().sequence.cameras[0]).rgb)
+
+        monkeypatch.setattr(command, "until_told_to_stop", removed)
+        given = ["view", SEQUENCE, "--profile", "quick", "--store", store.root, *SETTINGS, "--device", "cpu"]
+        assert main([*given, "--port", "0"]) == 0
+        assert bool(torch.isfinite(pictures[0]).all())
+        capsys.readouterr()
+        assert main(given) == 1
+        assert "--scene coarse" in capsys.readouterr().err
 
 
 class TestBrowser:

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from extrags.config import PretrainedConfig
 from extrags.errors import ConfigError, NonFiniteError
+from extrags.events import MetricRecorded, emit
 from extrags.restoration.pretrained.model import PipelineRule, load_pipeline
 
 __all__ = ["Adapter", "Window", "pictures", "seeded"]
@@ -157,6 +158,17 @@ class Adapter(ABC):
                 f"{self.rule.pipeline} returned NaN or infinity; try enhance.pretrained.dtype=float32"
             )
         return images.clip(0, 1)
+
+    def step_made(
+        self, pipeline: Any, step: int, timestep: Any, tensors: Mapping[str, Tensor]
+    ) -> dict[str, Tensor]:
+        """Tells of a denoising step, as `callback_on_step_end` of a pipeline, and changes nothing.
+
+        A clip can take an hour: whoever listens may also end it here, at a limit of time for instance. How
+        many clips are done is counted elsewhere, so this is no `Progress` of the stage.
+        """
+        emit(MetricRecorded("enhance", "denoising_step", step + 1))
+        return {}
 
     def encoded_text(self) -> dict[str, Tensor]:
         """The encoded caption on the pipeline's device."""

@@ -73,6 +73,7 @@ class LtxCondition(Adapter):
             decode_timestep=DECODE_TIMESTEP,
             decode_noise_scale=DECODE_NOISE_SCALE,
             generator=seeded(seed),
+            callback_on_step_end=self.step_made,
             output_type="np",
             **self.encoded_text(),
         )

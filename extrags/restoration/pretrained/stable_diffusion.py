@@ -38,6 +38,7 @@ class _StableDiffusion(Adapter):
                 num_inference_steps=self.steps,
                 guidance_scale=self.guidance(self.settings),
                 generator=[seeded(seed) for _ in images],
+                callback_on_step_end=self.step_made,
                 output_type="np",
                 **{name: value.expand(count, -1, -1) for name, value in self.encoded_text().items()},
                 **self._further(window, chosen),

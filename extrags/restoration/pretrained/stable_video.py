@@ -60,7 +60,8 @@ class StableVideo(Adapter):
         sigmas = self._sigmas()
         known = self._known(window.unknown, clean)
 
-        def put_back(_: Any, step: int, __: Any, inputs: dict[str, Tensor]) -> dict[str, Tensor]:
+        def put_back(pipe: Any, step: int, time: Any, inputs: dict[str, Tensor]) -> dict[str, Tensor]:
+            self.step_made(pipe, step, time, inputs)
             latents = inputs["latents"]
             original = (clean + sigmas[step + 1] * noise)[None].to(latents)
             return {"latents": torch.lerp(latents, original, known.to(latents))}

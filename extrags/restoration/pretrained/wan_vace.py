@@ -64,6 +64,7 @@ class WanVace(Adapter):
             num_inference_steps=self.steps,
             guidance_scale=self.guidance(self.settings),
             generator=seeded(seed),
+            callback_on_step_end=self.step_made,
             output_type="np",
             **self.encoded_text(),
         )

@@ -9,6 +9,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from extrags.metrics.fronts import fronts, means_by_cell
 from extrags.report import ReportInputs, charts
 from extrags.report.chart_labels import LONGEST_LABEL, row_labels
 from extrags.report.charts import (
@@ -26,6 +27,7 @@ from extrags.report.downloads import Chart
 from extrags.report.fronts_plot import write_fronts_plot
 from extrags.report.run_comparison import ComparedRun, build_run_comparison
 from extrags.report.trend import trend_chart
+from tests.extrags.metrics.test_fronts import case
 from tests.extrags.report.conftest import result_of
 
 
@@ -68,6 +70,18 @@ class TestLettersOfOtherScripts:
         assert f"{letter}</text>" in chart_of(letter)
         fonts("No Such Font", "STIXGeneral")
         assert "<text" not in chart_of(letter)
+
+    @pytest.mark.parametrize("kind", ["png", "svg"])
+    def test_images_of_bench_are_drawn_alike(
+        self, kind: str, fonts: Callable[..., None], tmp_path: Path, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        """Warnings are errors: matplotlib gave one for each letter, and drew boxes in SVG, too."""
+        fonts()
+        cells = means_by_cell([{**case("a", 10, 20), "sequence": "结肠\x07"}])
+        write_fronts_plot({"cells": cells, "fronts": fronts(cells)}, tmp_path / f"a.{kind}")
+        assert ("no font here has all letters" in caplog.text) == (kind == "png")
+        if kind == "svg":
+            assert r"结肠\x07" in (tmp_path / "a.svg").read_text()
 
 
 def numbers(chart: Chart) -> list[str]:

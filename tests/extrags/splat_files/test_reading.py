@@ -216,3 +216,30 @@ class TestSpzVersion4:
         (tmp_path / "bomb.spz").write_bytes(bytes(whole[:begin]) + bomb + bytes(whole[begin + first :]))
         with pytest.raises(SourceError, match="stream 1"):
             read_spz(tmp_path / "bomb.spz")
+
+    def test_a_small_file_of_many_gaussians_that_are_all_alike(self, tmp_path: Path) -> None:
+        """It does hold them: Zstandard says in four bytes that 128 kB are one number."""
+        from numcodecs.zstd import compress
+
+        count = 100_000
+        streams = [compress(bytes(count * size), 3) for size in (9, 1, 3, 3, 4, 45)]
+        sizes = (len(stream) for stream in streams)
+        table = b"".join(
+            struct.pack("<QQ", n, count * k) for n, k in zip(sizes, (9, 1, 3, 3, 4, 45), strict=True)
+        )
+        header = struct.pack("<4sIIBBBBI12x", b"NGSP", 4, count, 3, 12, 0, 6, 32)
+        (tmp_path / "a.spz").write_bytes(header + table + b"".join(streams))
+        with pytest.raises(
+            SourceError, match=r"a\.spz, field count: 100000 Gaussians of 6500000 bytes"
+        ) as told:
+            read_splat_file(tmp_path / "a.spz")
+        assert told.value.field == "count"
+
+
+def test_an_spz_that_announces_more_than_gzip_can_hold_takes_no_memory(
+    tmp_path: Path,
+) -> None:
+    content = packed(struct.pack("<4sIIBBBB", b"NGSP", 3, 10_000_000, 3, 12, 0, 0) + bytes(1000))
+    (tmp_path / "a.spz").write_bytes(content)
+    with pytest.raises(SourceError, match="10000000 Gaussians of 650000000 bytes announced in a file of"):
+        read_splat_file(tmp_path / "a.spz")

@@ -15,6 +15,7 @@ import torch
 
 from extrags.config import PretrainedConfig
 from extrags.errors import ConfigError, NonFiniteError, WeightsError
+from extrags.events import Event, MetricRecorded, subscribed
 from extrags.restoration.pretrained.adapter import Adapter, Window
 from extrags.restoration.pretrained.model import find_model
 from extrags.restoration.pretrained.stable_diffusion import (
@@ -140,6 +141,24 @@ class TestTinyPipelines:
         assert np.array_equal(first, opened.restore(given, 3))
         assert np.array_equal(first, adapter.open(folder, text, settings).restore(given, 3))
         assert not np.array_equal(first, opened.restore(given, 4))
+
+    def test_every_step_is_told_and_may_be_the_last(self, backend: str, saved: Callable[[str], Path]) -> None:
+        """Within a clip, which takes long at the size of a model, no limit of time ended it."""
+        adapter = opened(backend, saved)
+        events: list[Event] = []
+        with subscribed(events.append):
+            restored = adapter.restore(window(9), 3)
+        told = [(event.name, event.value) for event in events if isinstance(event, MetricRecorded)]
+        steps = [("denoising_step", float(step)) for step in range(1, adapter.steps_run + 1)]
+        assert told == steps * (len(told) // len(steps))
+        assert len(told) >= len(steps) > 1
+
+        def end(event: Event) -> None:
+            raise TimeoutError
+
+        with pytest.raises(TimeoutError), subscribed(end):
+            adapter.restore(window(9), 3)
+        assert np.array_equal(adapter.restore(window(9), 3), restored)
 
     def test_half_precision_runs(self, backend: str, saved: Callable[[str], Path]) -> None:
         adapter = ADAPTERS[backend]
