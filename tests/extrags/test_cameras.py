@@ -139,6 +139,8 @@ class TestCameras:
     def test_wrong_shapes_are_refused(self) -> None:
         with pytest.raises(ShapeError, match="world_from_camera"):
             Cameras(np.eye(3)[None], np.tile(np.eye(4), (2, 1, 1)), 4, 4)
+        with pytest.raises(ShapeError, match=r"found \(1, 3, 3\) and \(1, 3, 4\)"):
+            Cameras(np.eye(3)[None], np.eye(4)[None, :3], 4, 4)
 
     @pytest.mark.usefixtures("unchecked")
     @pytest.mark.parametrize("field", ["world_from_camera", "K"])
@@ -178,7 +180,17 @@ class TestRotations:
         with pytest.raises(PoseError, match=r"frame 0007.*mirrored"):
             as_rotation(np.diag([1.0, -1.0, 1.0]), frame="0007")
 
-    @pytest.mark.parametrize("bad", [2 * np.eye(3), np.full((3, 3), np.nan)])
+    @pytest.mark.parametrize(
+        "bad",
+        [
+            2 * np.eye(3),
+            np.full((3, 3), np.nan),
+            np.diag([1.0, 1.0, 1.2]),
+            np.eye(3) + 0.2 * np.eye(3, k=1),
+            np.where(np.eye(3, k=2) > 0, np.nan, np.eye(3)),
+        ],
+        ids=["scaled", "unknown", "scaled along one axis", "sheared", "one entry unknown"],
+    )
     def test_no_rotation_is_refused(self, bad: np.ndarray) -> None:
         with pytest.raises(PoseError):
             as_rotation(bad)
