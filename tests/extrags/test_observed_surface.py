@@ -46,7 +46,8 @@ def test_what_a_training_frame_shows_outside_its_mask_is_not_observed() -> None:
 
 def test_never_observed_is_told_of_held_out_pixels_with_depth_alone() -> None:
     shape = (3, 12, 16)
-    depth, observed, mask = np.full(shape, 10, np.float32), np.zeros(shape, bool), np.ones(shape, bool)
+    # In metres: what is known is not told by how large it is.
+    depth, observed, mask = np.full(shape, 0.01, np.float32), np.zeros(shape, bool), np.ones(shape, bool)
     depth[:, :3] = 0
     observed[:, 3:6] = True
     mask[:, :, :4] = False
@@ -134,6 +135,18 @@ class TestAgainstEveryPixelAlone:
         known = depth[list(self.TEST)] > 0
         assert 0.1 < expected[list(self.TEST)][known].mean() < 0.9
         np.testing.assert_array_equal(found, expected)
+
+    def test_the_unit_of_length_does_not_matter(self) -> None:
+        """Metres, or whatever structure from motion found: a power of two changes no digit."""
+        cameras, mask, depth = self.frames()
+        poses = cameras.world_from_camera.copy()
+        poses[:, :3, 3] /= 1024
+        small = Cameras(cameras.K, poses, cameras.width, cameras.height)
+        split = np.array(self.TRAIN), np.array(self.TEST)
+        np.testing.assert_array_equal(
+            observed_from_depth(small, mask, depth / np.float32(1024), *split),
+            observed_from_depth(cameras, mask, depth, *split),
+        )
 
     def test_tolerances_tell_pixels_apart(self) -> None:
         """What makes the comparison above one of tolerances, too."""

@@ -339,6 +339,55 @@ class TestHoleGaussians:
             found = hole_gaussians(wall_scene(None), far, views, self.ROOM)
             assert (found is not None) == some
 
+    def test_the_unit_of_length_does_not_matter(
+        self, sequence: EndoscopicSequence, pseudo: PseudoViews, holes: np.ndarray
+    ) -> None:
+        """Metres, or whatever structure from motion found: a power of two changes no digit."""
+        known = replace(sequence, mask=np.ones_like(sequence.mask))
+        assert known.depth_mm is not None
+        assert known.world_from_camera is not None
+        known = replace(known, depth_mm=np.maximum(known.depth_mm, 40))
+        depth = np.random.default_rng(0).uniform(20, 60, holes.shape)
+        means = []
+        for scale in (1.0, 2.0**-10):
+            poses, virtual = known.world_from_camera.copy(), pseudo.cameras.world_from_camera.copy()
+            for array in (poses, virtual):
+                array[:, :3, 3] *= scale
+            points = wall_scene(None).gaussians.means.double().numpy() * scale
+            scene = Scene(
+                Gaussians.from_points(points, np.full((50, 3), 0.5), np.full(50, 1e-3 * scale)), None
+            )
+            views = wall_views(pseudo, depth * scale, holes)
+            new = hole_gaussians(
+                scene,
+                replace(known, world_from_camera=poses, depth_mm=known.depth_mm * np.float32(scale)),
+                replace(views, cameras=replace(pseudo.cameras, world_from_camera=virtual)),
+                self.ROOM,
+                max_distance=200 * scale,
+            )
+            assert new is not None
+            means.append(new.means / scale)
+        assert 20 < len(means[0]) < np.count_nonzero(holes[:, ::2, ::2])
+        torch.testing.assert_close(means[0], means[1], rtol=8 * torch.finfo(torch.float32).eps, atol=0)
+
+    @pytest.mark.usefixtures("real_views_carve_alone")
+    def test_of_far_holes_no_more_light_is_divided_out_than_a_twentieth(
+        self, sequence: EndoscopicSequence, pseudo: PseudoViews, holes: np.ndarray
+    ) -> None:
+        """A dark pixel far away would become a Gaussian that glows from nearby."""
+        holes[1:] = False
+        blind = replace(sequence, mask=np.zeros_like(sequence.mask))
+        target = np.full_like(pseudo.target, 0.02)
+        views = replace(wall_views(pseudo, np.full(holes.shape, 3000.0), holes), target=target)
+        light = tube_light()
+        new = hole_gaussians(wall_scene(light), blind, views, self.ROOM)
+        assert new is not None
+        signal = light.invert_response(torch.tensor(0.02, dtype=torch.float64))
+        albedo = 0.28209479177387814 * new.sh0[:, 0].double() + 0.5
+        # Colours are kept about one half, so the rounding is that of numbers as large.
+        tolerance = 4 * torch.finfo(torch.float32).eps
+        torch.testing.assert_close(albedo, (signal / 0.05).expand_as(albedo), rtol=0, atol=tolerance)
+
     def test_nothing_to_fill(self, sequence: EndoscopicSequence, pseudo: PseudoViews) -> None:
         none = wall_views(pseudo, np.full((3, HEIGHT, WIDTH), 20.0), np.zeros((3, HEIGHT, WIDTH), dtype=bool))
         assert hole_gaussians(wall_scene(None), sequence, none, self.ROOM) is None
