@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation, Slerp
 
 from extrags.cameras import Cameras, rotation_about, rotation_angle_deg
 from extrags.exploration import Exploration, explore
@@ -275,6 +276,44 @@ class TestApproaches:
         np.testing.assert_allclose(found, allowed[: len(found)], rtol=1e-12)
         assert len(found) == min(12, len(allowed))
 
+    def test_a_straight_way_turns_by_the_shortest_rotation(self) -> None:
+        """From anywhere, in any direction: along the great circle between both orientations."""
+        generator = np.random.default_rng(8)
+        for _ in range(5):
+            start, end = np.eye(4), np.eye(4)
+            for pose in (start, end):
+                pose[:3, :3] = Rotation.random(random_state=generator).as_matrix()
+                pose[:3, 3] = generator.normal(size=3)
+            both = Slerp([0, 1], Rotation.from_matrix(np.stack([start[:3, :3], end[:3, :3]])))
+            poses = straight_way(start, end, 3)
+            share = np.array([1 / 3, 2 / 3, 1])
+            np.testing.assert_allclose(poses[:, :3, :3], both(share).as_matrix(), atol=1e-13)
+            centers = (1 - share[:, None]) * start[:3, 3] + share[:, None] * end[:3, 3]
+            np.testing.assert_allclose(poses[:, :3, 3], centers, atol=1e-14)
+            np.testing.assert_array_equal(poses[:, 3], [[0, 0, 0, 1]] * 3)
+
+    @pytest.mark.parametrize(
+        ("turn_deg", "distance", "views"),
+        [(50, 0.1, 3), (40, 0.1, 2), (41, 0.1, 3), (0, 0.0, 1), (5, 5.0, 2), (30, 5.01, 3), (170, 3.0, 9)],
+    )
+    def test_a_way_has_as_many_views_as_its_steps_and_its_turns_need(
+        self, turn_deg: float, distance: float, views: int
+    ) -> None:
+        start, end = np.eye(4), np.eye(4)
+        start[:3, :3] = rotation_about(np.array([1.0, 2, -1]), 0.7)
+        start[:3, 3] = [5.0, -3, 2]
+        end[:3, :3] = start[:3, :3] @ rotation_about(np.array([0.0, 1, 3]), np.radians(turn_deg))
+        end[:3, 3] = start[:3, 3] + distance * np.array([0.6, 0, 0.8])
+        seen = Seen(np.arange(2, dtype=np.int32), np.array([0.5, 1], np.float32))
+        value = ErrorValue(np.array([4.0, 6], np.float32))
+        known = np.zeros(2, np.float32)
+        approaches = Approaches(Destinations.of(end[None], [seen]), value, known, step_mm=2.5, turn_deg=20.0)
+        ((rate, poses),) = approaches.better(start, known, views, 0.0)
+        assert rate == pytest.approx(8 / views)
+        np.testing.assert_allclose(poses, straight_way(start, end, views), atol=1e-12)
+        # One view less than it takes is too few to get there.
+        assert list(approaches.better(start, known, views - 1, 0.0)) == []
+
     def test_a_straight_way_arrives_in_equal_steps(self):
         start, end = np.eye(4), np.eye(4)
         end[:3, :3] = rotation_about(np.array([0.0, 1.0, 0.0]), 1.2)
@@ -289,7 +328,6 @@ class TestApproaches:
 def moved_tube(tube: Tube, space: FreeSpace, scale: float, turn: np.ndarray) -> tuple[Tube, FreeSpace]:
     """The same world, scaled, turned and shifted."""
     import torch
-    from scipy.spatial.transform import Rotation
 
     shift = np.array([30.0, -7.0, 12.0])
     g = tube.scene.gaussians
