@@ -144,6 +144,80 @@ class TestProbes:
         assert probes.centers[:, 0].max() < 0
         assert np.linalg.norm(probes.centers - pose[:3, 3], axis=1).max() > 3
 
+    def in_the_open(self, rotation: np.ndarray, scale: float, **changes: object) -> tuple[Cameras, Cameras]:
+        """Three training views far from every wall, and their probes; the world is turned and scaled."""
+        free = np.full((12, 12, 12), FREE, np.uint8)
+        poses = np.tile(np.eye(4), (3, 1, 1))
+        poses[:, :3, :3] = rotation @ Rotation.random(3, random_state=np.random.default_rng(5)).as_matrix()
+        poses[:, :3, 3] = scale * np.array([[1.0, 0, 0], [0, 2, -1], [-1, 1, 3]]) @ rotation.T + [7.0, -40, 3]
+        origin = np.array([7.0, -40, 3]) - 60 * scale * rotation @ np.ones(3)
+        clearance = np.full(free.shape, 50 * scale, np.float32)
+        space = FreeSpace(free, origin, rotation.T.copy(), 10 * scale, clearance)
+        K = np.tile(np.array([[20.0, 0, 16], [0, 20.0, 12], [0, 0, 1]]), (3, 1, 1))
+        cameras = Cameras(K, poses, 32, 24)
+        config = error_config(**{"probe_views": 90, "probe_shift": 0.5, "probe_turn_deg": 40.0} | changes)
+        return cameras, probe_cameras(cameras, space, 12.0 * scale, 1.0 * scale, config)
+
+    def test_shifts_and_turns_are_even_up_to_their_limits(self) -> None:
+        cameras, probes = self.in_the_open(np.eye(3), 1.0)
+        which = np.repeat(np.arange(3), 30)
+        np.testing.assert_array_equal(probes.K, cameras.K[which])
+        shift = np.linalg.norm(probes.centers - cameras.centers[which], axis=1) / (0.5 * 12)
+        start = cameras.world_from_camera[which, :3, :3]
+        turn = rotation_angle_deg(probes.world_from_camera[:, :3, :3], start) / 40
+        for share in (shift, turn):
+            assert share.max() <= 1 + 1e-12
+            # Of 90 even draws between 0 and 1; the deviations of both bounds are five of the mean's.
+            assert share.mean() == pytest.approx(0.5, abs=5 / np.sqrt(12 * 90))
+            assert share.max() > 0.9
+        # In the camera's own frame every direction is as likely as any other.
+        side = np.einsum("nji,nj->ni", start, probes.centers - cameras.centers[which])
+        assert np.abs((np.sign(side)).mean(axis=0)).max() < 5 / np.sqrt(90)
+
+    def test_limits_scale_what_is_drawn(self) -> None:
+        cameras, probes = self.in_the_open(np.eye(3), 1.0)
+        _, twice = self.in_the_open(np.eye(3), 1.0, probe_shift=1.0, probe_turn_deg=80.0)
+        which = np.repeat(np.arange(3), 30)
+        moved = np.linalg.norm(probes.centers - cameras.centers[which], axis=1) > 0.24
+        np.testing.assert_allclose(
+            (twice.centers - cameras.centers[which])[moved],
+            2 * (probes.centers - cameras.centers[which])[moved],
+            atol=1e-12,
+        )
+        start = cameras.world_from_camera[which, :3, :3]
+        np.testing.assert_allclose(
+            rotation_angle_deg(twice.world_from_camera[:, :3, :3], start),
+            2 * rotation_angle_deg(probes.world_from_camera[:, :3, :3], start),
+            atol=1e-5,
+        )
+
+    def test_move_with_the_world(self) -> None:
+        turn = rotation_about(np.array([1.0, -2, 0.5]), 1.1)
+        _, probes = self.in_the_open(np.eye(3), 1.0)
+        _, moved = self.in_the_open(turn, 3.0)
+        origin = np.array([7.0, -40, 3])
+        np.testing.assert_allclose(
+            moved.centers - origin, 3 * (probes.centers - origin) @ turn.T, rtol=0, atol=1e-11
+        )
+        np.testing.assert_allclose(
+            moved.world_from_camera[:, :3, :3], turn @ probes.world_from_camera[:, :3, :3], atol=1e-13
+        )
+
+    def test_are_shifted_by_a_fiftieth_of_the_depth_or_not_at_all(self) -> None:
+        """Also where a wall is so near that the shift is halved again and again."""
+        occupancy = np.full((16, 16, 16), FREE, np.uint8)
+        occupancy[8:] = OCCUPIED
+        space = FreeSpace(occupancy, np.full(3, -8.0), np.eye(3), 1.0, np.ones((16, 16, 16), np.float32))
+        pose = np.eye(4)
+        pose[0, 3] = -0.2
+        config = error_config(probe_shift=1.0, probe_views=200)
+        probes = probe_cameras(square_camera(pose), space, 6.0, 0.1, config)
+        shift = np.linalg.norm(probes.centers - pose[:3, 3], axis=1)
+        assert probes.centers[:, 0].max() < 0
+        assert np.all((shift == 0) | (shift > 0.02 * 6 * (1 - 1e-12)))
+        assert np.any(shift == 0)
+        assert np.any((shift > 0) & (shift < 0.04 * 6))
+
     def test_another_seed_gives_others(self):
         first, second = context().measured, context(seed=1).measured
         assert not np.array_equal(first.destinations.poses, second.destinations.poses)
