@@ -13,7 +13,14 @@ from extrags.cameras import Cameras, rotation_about, rotation_angle_deg
 from extrags.exploration import Exploration, explore
 from extrags.exploration.approach import Approaches, straight_way
 from extrags.exploration.expected_error import Sizes, measure_sizes, probe_cameras
-from extrags.exploration.measurements import Destinations, SceneMeasurements, frontier_of, measure_scene
+from extrags.exploration.measurements import (
+    Destinations,
+    SceneMeasurements,
+    _fit_to_be_views,
+    frontier_of,
+    measure_scene,
+)
+from extrags.exploration.observation import Observation
 from extrags.exploration.search import Branch, SearchContext, grow_branch, prepare_search
 from extrags.exploration.seen import ErrorValue, PairValue, Seen, Value, union
 from extrags.freespace import FREE, OCCUPIED, FreeSpace, carve
@@ -260,6 +267,63 @@ class TestMeasureScene:
             for masks in (None, [mask] * len(cameras))
         )
         np.testing.assert_array_equal(plain.known, masked.known)
+
+    def test_only_probes_that_could_be_virtual_views_are_destinations(self) -> None:
+        occupancy = np.full((6, 6, 6), FREE, np.uint8)
+        occupancy[3:] = OCCUPIED
+        # Two millimetres of room, but for one layer of voxels.
+        clearance = np.full(occupancy.shape, 2.0, np.float32)
+        clearance[2] = 1.9
+        space = FreeSpace(occupancy, np.zeros(3), np.eye(3), 1.0, clearance)
+        nothing = Sizes(np.zeros(0, np.int32), np.zeros(0, np.float32))
+
+        def probe(x: float, *, saturated: float = 0.0, rejected: bool = False) -> Observation:
+            pose = np.eye(4)
+            pose[:3, 3] = x, 2.5, 2.5
+            return Observation(
+                pose=pose,
+                visible=np.zeros(0, np.int32),
+                sizes=nothing,
+                holes=np.zeros((2, 2), bool),
+                depth_mm=np.ones(4, np.float32),
+                look_at_mm=1.0,
+                dark=np.zeros(3),
+                saturated_share=saturated,
+                rejected=rejected,
+            )
+
+        probes = [
+            probe(1.5),
+            probe(2.5),  # too near to the wall
+            probe(4.5),  # behind it
+            probe(0.5, rejected=True),
+            probe(0.5, saturated=0.2),
+            probe(0.5, saturated=0.21),  # too bright
+        ]
+        config = error_config(safety_share=0.2, max_saturated_share=0.2)
+        assert _fit_to_be_views(probes, space, 10.0, config) == [0, 4]
+        assert _fit_to_be_views(probes, space, 5.0, config) == [0, 1, 4]
+        none = config.model_copy(update={"destinations": False})
+        assert _fit_to_be_views(probes, space, 5.0, none) == []
+
+    def test_removable_error_is_what_is_not_known_yet(self) -> None:
+        measured = context().measured
+        assert isinstance(measured.value, ErrorValue)
+        known, error = measured.known.astype(np.float64), measured.value.error.astype(np.float64)
+        assert measured.removable_error == pytest.approx(sum((1 - known) * error), rel=1e-6)
+        assert context(score="pairs").measured.removable_error == 0
+
+    def test_virtual_views_have_the_usual_intrinsics(self) -> None:
+        """The median of the recording's, one by one: a frame that was zoomed into changes nothing."""
+        measured = context().measured
+        K = measured.training.K.copy()
+        K[0, 0, 0] *= 3
+        zoomed = replace(measured, training=replace(measured.training, K=K))
+        poses = measured.training.world_from_camera[:2]
+        found = zoomed.cameras(poses)
+        np.testing.assert_array_equal(found.K, measured.training.K[[1, 1]])
+        np.testing.assert_array_equal(found.world_from_camera, poses)
+        assert (found.width, found.height) == (measured.training.width, measured.training.height)
 
     def test_round_trip_on_disk(self, tmp_path):
         for ready in (context(), context(score="pairs")):
