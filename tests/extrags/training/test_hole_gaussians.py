@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from extrags.gaussians import Gaussians
 from extrags.illumination import NearFieldLight
@@ -100,8 +101,63 @@ class TestSurfaceThatFramesSaw:
         assert (found[:, 20:] > 0).mean() > 0.9
 
 
+class TestCells:
+    def test_points_of_a_cell_are_averaged_with_their_colours(self) -> None:
+        """Cells are counted from the lowest corner, wherever the points lie."""
+        generator = np.random.default_rng(0)
+        points = generator.uniform(-7, 9, (200, 3)) + np.array([40.0, -60, 3])
+        rgb = generator.random((200, 3))
+        found, colours = placing._one_per_cell(points, rgb, 4.0)
+        cells: dict[tuple[float, ...], list[int]] = {}
+        for index, point in enumerate(points):
+            cells.setdefault(tuple((point - points.min(axis=0)) // 4.0), []).append(index)
+        assert 20 < len(cells) < 100
+        order = sorted(cells)
+        expected = np.array([points[cells[cell]].mean(axis=0) for cell in order])
+        means = np.array([rgb[cells[cell]].mean(axis=0) for cell in order])
+        apart, which = cKDTree(expected).query(found)
+        assert apart.max() < 1e-12
+        assert sorted(which.tolist()) == list(range(len(order)))
+        np.testing.assert_allclose(colours, means[which], rtol=1e-12)
+
+    def test_spacing_is_that_of_most_gaussians(self) -> None:
+        """One and a half times the way to the nearest neighbour; floaters and clusters say nothing."""
+        lattice = 2.0 * np.argwhere(np.ones((5, 5, 5)))
+        floaters = np.array([[1e4 * k, 0, 0] for k in range(1, 20)])
+        cluster = np.array([-50.0, 0, 0]) + 1e-3 * np.argwhere(np.ones((2, 3, 3)))
+        points = np.concatenate([lattice, floaters, cluster])
+        gaussians = Gaussians.from_points(points, np.full(points.shape, 0.5), np.full(len(points), 1.0))
+        assert placing._typical_spacing(gaussians) == pytest.approx(3.0, rel=1e-6)
+
+
 class TestHoleGaussians:
     ROOM = 10_000
+
+    @pytest.mark.usefixtures("real_views_carve_alone")
+    @pytest.mark.parametrize("thickness", [1.0, 0.1])
+    def test_lie_flat_on_the_surface(
+        self, sequence: EndoscopicSequence, pseudo: PseudoViews, holes: np.ndarray, thickness: float
+    ) -> None:
+        holes[1:] = False
+        blind = replace(sequence, mask=np.zeros_like(sequence.mask))
+        # A slanted plane n x = d before the first camera.
+        n, d = np.array([0.3, -0.2, 0.9]) / math.sqrt(0.94), 14.0
+        K = pseudo.cameras.K[0]
+        v, u = np.mgrid[0:HEIGHT, 0:WIDTH] + 0.5
+        rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=-1)
+        views = wall_views(pseudo, np.repeat((d / (rays @ n))[None], 3, axis=0), holes)
+        new = hole_gaussians(wall_scene(None), blind, views, self.ROOM, thickness=thickness)
+        assert new is not None
+        scales = np.sort(new.scales.double().exp().numpy(), axis=1)
+        np.testing.assert_allclose(scales[:, 1], scales[:, 2], rtol=1e-5)
+        np.testing.assert_allclose(scales[:, 0], thickness * scales[:, 1], rtol=1e-5)
+        np.testing.assert_allclose(torch.sigmoid(new.opacities), 0.3, rtol=1e-5)
+        if thickness != 1:
+            axes = Rotation.from_quat(new.quats.double().numpy()[:, [1, 2, 3, 0]]).as_matrix()
+            thin = axes[np.arange(len(new)), :, new.scales.argmin(dim=1).numpy()]
+            normal = pseudo.cameras.world_from_camera[0, :3, :3] @ n
+            # Depths are of single precision, and neighbours 0.6 mm apart at 14 mm.
+            np.testing.assert_allclose(np.abs(thin @ normal), 1, atol=1e-5)
 
     @pytest.mark.usefixtures("real_views_carve_alone")
     def test_lie_at_the_restored_depth_along_their_rays(
