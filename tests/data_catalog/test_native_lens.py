@@ -15,6 +15,7 @@ from data_catalog.readers.colmap_files import read_model, write_model
 from data_catalog.readers.colmap_model import write_colmap
 from data_catalog.readers.transforms_json import write_transforms
 from extrags.cameras import (
+    invert_poses,
     pixel_rays,
     project_points,
     rotation_about,
@@ -175,6 +176,13 @@ def test_a_turned_lens_turns_its_poses(tmp_path) -> None:
     turned = rotation_angle_deg(native.world_from_camera[:, :3, :3], pinhole.world_from_camera[:, :3, :3])
     np.testing.assert_allclose(turned, 0.167, atol=0.002)
     np.testing.assert_array_equal(native.world_from_camera[:, :3, 3], pinhole.world_from_camera[:, :3, 3])
+    # What a camera has at a direction, its turned image has at the turned one (`test_published_lenses`).
+    roll = rotation_about(np.array([0.0, 0, 1]), CALIBRATIONS["c3vd"].radial().roll_rad)
+    point = np.array([3.0, -20, 40])
+    for frame in range(2):
+        seen = invert_poses(pinhole.world_from_camera[frame]) @ [*point, 1]
+        seen_turned = invert_poses(native.world_from_camera[frame]) @ [*point, 1]
+        np.testing.assert_allclose(seen_turned[:3], roll @ seen[:3], rtol=0, atol=1e-9)
 
 
 def test_a_pinhole_has_no_lens_to_keep(clip, tmp_path) -> None:

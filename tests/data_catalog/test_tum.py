@@ -13,6 +13,7 @@ from PIL import Image
 
 from data_catalog import glance, read, resolve, source_fingerprint
 from data_catalog.inspection import inspect
+from data_catalog.readers.tum import _nearest
 from extrags.config import IngestConfig
 from extrags.errors import PoseError, SourceError, SourceNotFoundError
 from tests.data_catalog.damage import line, removed, words
@@ -163,6 +164,38 @@ class TestReading:
             "\ufeff" + file.read_text().replace(" ", ",\t").replace("#,\t", "# "), encoding="utf-8"
         )
         np.testing.assert_allclose(read(folder).world_from_camera, clip.world_from_camera, atol=1e-5)
+
+
+@pytest.mark.parametrize(("frames_hz", "poses_hz"), [(30, 30), (30, 100), (60, 60), (15, 200), (100, 30)])
+@pytest.mark.parametrize("offset_s", [-0.015, -0.004, 0.0, 0.009])
+def test_pairs_are_those_of_all_within_a_fiftieth_of_a_second(
+    frames_hz: int, poses_hz: int, offset_s: float
+) -> None:
+    """As `associate.py` of the benchmark has it: of all pairs the nearest first, each in one alone."""
+    generator = np.random.default_rng(frames_hz)
+
+    def times(hz: int, start_s: float) -> list[float]:
+        return (start_s + (np.arange(2 * hz) + generator.normal(0, 0.15, 2 * hz)) / hz).tolist()
+
+    frames, poses = times(frames_hz, 1305031102.0), times(poses_hz, 1305031102.0 + offset_s)
+    generator.shuffle(poses)
+    pairs = sorted(
+        (abs(other_s - time_s), time_s, index)
+        for time_s in frames
+        for index, other_s in enumerate(poses)
+        if abs(other_s - time_s) <= 0.02
+    )
+    expected: dict[float, int] = {}
+    for _, time_s, index in pairs:
+        if time_s not in expected and index not in expected.values():
+            expected[time_s] = index
+    assert len(expected) > 0.4 * min(len(frames), len(poses))
+    assert _nearest(frames, poses) == expected
+
+
+def test_poses_of_no_time_near_have_no_frame() -> None:
+    assert _nearest([1.0, 2.0], [1.021, 1.981]) == {2.0: 1}
+    assert _nearest([1.0], []) == {}
 
 
 def later(seconds: float) -> Callable[[Path], None]:

@@ -11,9 +11,11 @@ from extrags.cameras import (
     Cameras,
     as_rotation,
     compose,
+    field_mask,
     invert_poses,
     look_at,
     pixel_rays,
+    pose_distances,
     project_points,
     rays_of_pixels,
     rotation_about,
@@ -137,6 +139,8 @@ class TestCameras:
     def test_wrong_shapes_are_refused(self) -> None:
         with pytest.raises(ShapeError, match="world_from_camera"):
             Cameras(np.eye(3)[None], np.tile(np.eye(4), (2, 1, 1)), 4, 4)
+        with pytest.raises(ShapeError, match=r"found \(1, 3, 3\) and \(1, 3, 4\)"):
+            Cameras(np.eye(3)[None], np.eye(4)[None, :3], 4, 4)
 
     @pytest.mark.usefixtures("unchecked")
     @pytest.mark.parametrize("field", ["world_from_camera", "K"])
@@ -147,6 +151,18 @@ class TestCameras:
         arrays[field][1, 0, 2] = value
         with pytest.raises(PoseError, match=f"{field}: view 1 of 3 holds NaN or infinity"):
             Cameras(**arrays, width=4, height=3).check_finite()
+
+    def test_forward_is_the_ray_of_the_principal_point(self) -> None:
+        batch = cameras(4)
+        # Pixel centres lie at +0.5, the principal point between four of them.
+        middle = pixel_rays(batch)[:, 23:25, 31:33].mean(axis=(1, 2))
+        np.testing.assert_allclose(batch.forward, middle, atol=1e-12)
+
+    def test_concatenated_keeps_the_order_of_views(self) -> None:
+        batch = cameras(5)
+        joined = Cameras.concatenated([batch[3:], batch[:2]])
+        np.testing.assert_array_equal(joined.world_from_camera, batch.world_from_camera[[3, 4, 0, 1]])
+        assert (joined.width, joined.height) == (64, 48)
 
     def test_concatenated_needs_equal_sizes(self) -> None:
         with pytest.raises(ShapeError, match="sizes"):
@@ -164,10 +180,31 @@ class TestRotations:
         with pytest.raises(PoseError, match=r"frame 0007.*mirrored"):
             as_rotation(np.diag([1.0, -1.0, 1.0]), frame="0007")
 
-    @pytest.mark.parametrize("bad", [2 * np.eye(3), np.full((3, 3), np.nan)])
+    @pytest.mark.parametrize(
+        "bad",
+        [
+            2 * np.eye(3),
+            np.full((3, 3), np.nan),
+            np.diag([1.0, 1.0, 1.2]),
+            np.eye(3) + 0.2 * np.eye(3, k=1),
+            np.where(np.eye(3, k=2) > 0, np.nan, np.eye(3)),
+        ],
+        ids=["scaled", "unknown", "scaled along one axis", "sheared", "one entry unknown"],
+    )
     def test_no_rotation_is_refused(self, bad: np.ndarray) -> None:
         with pytest.raises(PoseError):
             as_rotation(bad)
+
+    @pytest.mark.parametrize(
+        ("scale", "is_one"), [(0.991, True), (1.009, True), (0.989, False), (1.011, False)]
+    )
+    def test_only_rounding_is_taken_for_a_rotation(self, scale: float, is_one: bool) -> None:
+        for rotation in Rotation.random(20, random_state=np.random.default_rng(3)).as_matrix():
+            if is_one:
+                np.testing.assert_allclose(as_rotation(scale * rotation), rotation, atol=1e-14)
+            else:
+                with pytest.raises(PoseError, match="not a rotation"):
+                    as_rotation(scale * rotation)
 
     def test_rodrigues_agrees_with_scipy(self) -> None:
         axis = np.array([1.0, -2.0, 0.5])
@@ -178,11 +215,52 @@ class TestRotations:
         turned = rotation_about(np.array([0.0, 0, 1]), np.radians(25))
         assert rotation_angle_deg(np.eye(3), turned) == pytest.approx(25)
 
+    def test_angles_of_nearly_the_same_and_of_opposite_orientations(self) -> None:
+        """Rounding takes the trace beyond 3 and below -1, where there is no arc cosine."""
+        turns = Rotation.random(200, random_state=np.random.default_rng(0)).as_matrix()
+        half = np.stack([2 * np.outer(turn[0], turn[0]) - np.eye(3) for turn in turns])
+        # The arc cosine has half the digits at both ends.
+        digits = np.degrees(4 * np.sqrt(np.finfo(np.float64).eps))
+        np.testing.assert_allclose(rotation_angle_deg(turns, turns), 0, atol=digits)
+        np.testing.assert_allclose(rotation_angle_deg(turns, turns @ half), 180, atol=digits)
+
+    def test_distances_are_ways_and_turns_added(self) -> None:
+        first, second = cameras(3), Cameras(np.tile(np.eye(3), (2, 1, 1)), random_poses(2, seed=5), 64, 48)
+        found = pose_distances(first, second, 7.0)
+        assert found.shape == (3, 2)
+        for a in range(3):
+            for b in range(2):
+                one, other = first.world_from_camera[a], second.world_from_camera[b]
+                turn = Rotation.from_matrix(one[:3, :3].T @ other[:3, :3]).magnitude()
+                way = np.sqrt(((one[:3, 3] - other[:3, 3]) ** 2).sum()) / 7.0
+                assert found[a, b] == pytest.approx(way + turn, rel=1e-12)
+
     @pytest.mark.parametrize("up", [np.array([0.0, -1, 0]), np.array([0.0, 0, 1])])
     def test_look_at_is_a_rotation_that_looks_there(self, up: np.ndarray) -> None:
         pose = look_at(np.array([1.0, 2, 3]), np.array([1.0, 2, 9]), up)
         np.testing.assert_allclose(pose[:3, 2], [0, 0, 1], atol=1e-12)
         assert np.linalg.det(pose[:3, :3]) == pytest.approx(1)
+
+    def test_what_lies_up_is_seen_above_the_target(self) -> None:
+        center, target, up = np.array([3.0, -2, 1]), np.array([-4.0, 5, 2.5]), np.array([0.2, 0.5, 3.0])
+        pose = look_at(center, target, up)
+        np.testing.assert_allclose(pose[:3, :3].T @ pose[:3, :3], np.eye(3), atol=1e-14)
+        assert np.linalg.det(pose[:3, :3]) == pytest.approx(1)
+        np.testing.assert_array_equal(pose[:3, 3], center)
+        K = np.array([[50.0, 0, 32], [0, 50.0, 24], [0, 0, 1]])
+        pixels = project_points(transform_points(invert_poses(pose), np.stack([target, target + up])), K)
+        np.testing.assert_allclose(pixels[0], [32, 24], atol=1e-11)
+        # The axis of "up" stands upright in the image: to neither side of the target.
+        assert pixels[1, 0] == pytest.approx(32, abs=1e-11)
+        assert pixels[1, 1] < 24
+
+    @pytest.mark.parametrize("sign", [1.0, -1.0])
+    @pytest.mark.parametrize("axis", range(3))
+    def test_looking_along_up_is_a_rotation_too(self, axis: int, sign: float) -> None:
+        along = sign * np.eye(3)[axis]
+        pose = look_at(np.zeros(3), 5 * along, along)
+        np.testing.assert_allclose(pose[:3, :3].T @ pose[:3, :3], np.eye(3), atol=1e-15)
+        np.testing.assert_array_equal(pose[:3, 2], along)
 
     def test_look_at_itself_is_refused(self) -> None:
         with pytest.raises(PoseError):
@@ -193,8 +271,11 @@ class TestRotations:
         np.testing.assert_allclose(invert_poses(invert_poses(poses)), poses, atol=1e-12)
 
     def test_compose(self) -> None:
-        pose = compose(np.eye(3), np.array([1.0, 2, 3]))
+        turn = rotation_about(np.array([1.0, 2, 3]), 0.4)
+        pose = compose(turn, np.array([1.0, 2, 3]))
+        np.testing.assert_array_equal(pose[:3, :3], turn)
         np.testing.assert_array_equal(pose[:3, 3], [1, 2, 3])
+        np.testing.assert_array_equal(pose[3], [0, 0, 0, 1])
 
 
 class TestInterpolated:
@@ -212,6 +293,25 @@ class TestInterpolated:
         turned = rotation_angle_deg(between.world_from_camera[2, :3, :3], first[:3, :3])
         assert turned == pytest.approx(45.0)
         assert between.K[2, 0, 0] == pytest.approx(20.0)
+
+    def test_every_stretch_runs_between_its_own_two_cameras(self) -> None:
+        poses, steps = random_poses(4), 3
+        K = np.tile(np.array([[50.0, 0, 32], [0, 40.0, 24], [0, 0, 1]]), (4, 1, 1))
+        K[:, 0, 0] += [0.0, 6, -9, 3]
+        found = Cameras(K, poses, 64, 48).interpolated(steps)
+        assert len(found) == 10
+        for stretch in range(3):
+            first, second = poses[stretch], poses[stretch + 1]
+            turn = Rotation.from_matrix(first[:3, :3].T @ second[:3, :3]).as_rotvec()
+            for step in range(steps):
+                at, share = stretch * steps + step, step / steps
+                center = first[:3, 3] + share * (second[:3, 3] - first[:3, 3])
+                rotation = first[:3, :3] @ Rotation.from_rotvec(share * turn).as_matrix()
+                np.testing.assert_allclose(found.centers[at], center, atol=1e-12)
+                np.testing.assert_allclose(found.world_from_camera[at, :3, :3], rotation, atol=1e-12)
+                expected = K[stretch] + share * (K[stretch + 1] - K[stretch])
+                np.testing.assert_allclose(found.K[at], expected, atol=1e-12)
+        np.testing.assert_allclose(found.world_from_camera[-1], poses[-1], atol=1e-12)
 
     def test_one_camera_goes_nowhere(self) -> None:
         pose = look_at(np.zeros(3), np.array([0.0, 0.0, 1.0]), np.array([0.0, -1.0, 0.0]))
@@ -236,3 +336,38 @@ def test_rays_of_some_pixels_have_the_bits_of_all(lens: RadialLens | None, seed:
     at = np.flatnonzero((generator.random(len(every)) < 0.1) & (np.arange(len(every)) // (41 * 29) != 2))
     assert np.array_equal(rays_of_pixels(cameras, at), every[at])
     assert rays_of_pixels(cameras, at[:0]).shape == (0, 3)
+
+
+def test_a_field_is_that_of_its_own_principal_point_and_focal_lengths() -> None:
+    K = np.array([[20.0, 0, 31.5], [0, 12.0, 17.25], [0, 0, 1]])
+    found = field_mask(K, LENS, 70, 40)
+    assert found.shape == (40, 70)
+    assert 0.2 < found.mean() < 0.5
+    for row in range(40):
+        for column in range(70):
+            corners = [(column + dx, row + dy) for dx in (0, 1) for dy in (0, 1)]
+            farthest = max(np.hypot((u - 31.5) / 20, (v - 17.25) / 12) for u, v in corners)
+            assert found[row, column] == (farthest <= LENS.max_radius)
+    batch = Cameras(np.stack([K, K + np.diag([5.0, 5.0, 0])]), np.tile(np.eye(4), (2, 1, 1)), 70, 40, LENS)
+    np.testing.assert_array_equal(batch.field[0], found)
+    assert batch.field[1].sum() > found.sum()
+
+
+def test_all_of_a_pinhole_is_its_field() -> None:
+    assert cameras(2).field.shape == (2, 48, 64)
+    assert cameras(2).field.all()
+
+
+def test_rays_of_several_cameras_with_a_lens_are_those_of_each_alone() -> None:
+    """Cameras of the same intrinsics share the work; these have two, in turns."""
+    K = np.tile(np.array([[20.0, 0, 16], [0, 21.0, 12], [0, 0, 1]]), (4, 1, 1))
+    K[1::2, 0, 0] = 26.0
+    batch = Cameras(K, random_poses(4), 32, 24, LENS)
+    rays = pixel_rays(batch)
+    for index in range(4):
+        np.testing.assert_array_equal(rays[index], pixel_rays(batch[index])[0])
+        local = rays[index] @ batch.world_from_camera[index, :3, :3]
+        pixels = project_points(local, K[index], LENS)
+        v, u = np.mgrid[:24, :32] + 0.5
+        seen = batch.field[index]
+        np.testing.assert_allclose(pixels[seen], np.stack([u, v], axis=-1)[seen], rtol=0, atol=1e-9)

@@ -30,3 +30,12 @@ def test_the_unit_does_not_matter() -> None:
     depth = np.array([1.0, 1.0, 0.9 * FARTHEST, 1.1 * FARTHEST])
     for scale in (1e-6, 1.0, 1e6):
         assert is_background(scale * depth).tolist() == [False, False, False, True]
+
+
+@pytest.mark.parametrize("known", [11, 19, 20, 21, 31])
+def test_a_thousand_times_what_a_tenth_of_the_known_depths_is_nearer_than(known: int) -> None:
+    wall = np.geomspace(1, 3, known - 2)
+    near = float(wall[(known - 1) // 10])
+    # Unknown depth is no near one, however much of it there is.
+    depth = np.concatenate([np.zeros(2 * known), wall[::-1], [999 * near, 1001 * near]])
+    assert np.flatnonzero(is_background(depth)).tolist() == [len(depth) - 1]

@@ -14,6 +14,7 @@ from extrags.exploration.coverage import (
     direction_counts,
     rendered_pairs,
     training_coverage,
+    view_pairs,
 )
 
 from .tube import SEEN, scene_of_points, small_tube, square_camera
@@ -62,6 +63,24 @@ class TestDirectionBins:
         edges = np.array([[0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0], [1, -0.0, 0], [0, -1, 0]], float)
         index = direction_bin(edges, 32)
         assert ((index >= 0) & (index < 32)).all()
+
+    @pytest.mark.parametrize(
+        ("n", "collars"),
+        [(2, [1, 1]), (3, [1, 1, 1]), (4, [1, 2, 1]), (10, [1, 4, 4, 1]), (32, [1, 6, 9, 9, 6, 1])],
+    )
+    def test_cells_per_collar_are_those_of_the_recursive_partition(self, n: int, collars: list[int]) -> None:
+        """As the program of its author has them: `eq_caps(2, 10)` is printed in its documentation."""
+        turn = np.linspace(0, 2 * np.pi, 720, endpoint=False)
+        # North to south, in the middle of each collar by area; cells are counted in the same order.
+        below = np.cumsum(collars)
+        first = below - collars
+        for k in range(len(collars)):
+            z = 1 - (first[k] + below[k]) / n
+            ring = np.sqrt(1 - z**2)
+            unit = np.stack([ring * np.cos(turn), ring * np.sin(turn), np.full_like(turn, z)], axis=1)
+            cells, count = np.unique(direction_bin(unit, n), return_counts=True)
+            np.testing.assert_array_equal(cells, np.arange(first[k], below[k]))
+            np.testing.assert_allclose(count, 720 / collars[k], atol=1)
 
     @pytest.mark.parametrize("n", [1, 33])
     def test_more_bins_than_bits_are_refused(self, n):
@@ -128,6 +147,19 @@ class TestViewPairs:
         _, seen = rendered_pairs(scene, square_camera(), **SEEN)
         expected = direction_bin(np.array([[0.0, 0.0, -1.0]]), 32)[0]
         assert seen[0, 0] == np.uint32(1) << np.uint32(expected)
+
+    def test_the_direction_does_not_depend_on_the_distance(self) -> None:
+        generator = np.random.default_rng(2)
+        scene = scene_of_points(generator.normal(size=(40, 3)))
+        center = np.array([0.2, -0.1, 0.3])
+        seen = np.arange(3, 40, 2)
+        points = scene.gaussians.means.numpy().astype(np.float64)[seen]
+        expected = [direction_bin(d / np.sqrt(d @ d), 20) for d in center - points]
+        words = view_pairs(scene, center, seen, 20)
+        np.testing.assert_array_equal(words, [1 << int(k) for k in expected])
+        # The same directions from a hundred times as far.
+        far = scene_of_points(100 * scene.gaussians.means.numpy())
+        np.testing.assert_array_equal(view_pairs(far, 100 * center, seen, 20), words)
 
     @pytest.mark.parametrize("per_batch", [1, 2, 16])
     def test_each_view_covers_what_its_own_mask_leaves(self, per_batch, monkeypatch):

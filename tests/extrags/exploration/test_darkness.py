@@ -89,6 +89,18 @@ class TestDarkDirection:
         column, row = pixel_of(ray)
         assert np.hypot(column - 20, row - 30) < 5
 
+    def test_dark_is_told_by_the_median_of_the_view(self) -> None:
+        """A highlight, which raises the mean alone, makes nothing else dark."""
+        image = np.where(COLUMNS < 28, 1.5, 0.5)
+        image[disc(60, 30, 8)] = 0.4
+        flat = 30.0 / DISTANCE_PER_DEPTH
+        ray = dark_direction(CAMERA, grey(image), np.ones_like(image), flat, None)
+        np.testing.assert_array_equal(ray, 0)
+        image[disc(60, 30, 8)] = 0.3
+        ray = dark_direction(CAMERA, grey(image), np.ones_like(image), flat, None)
+        column, row = pixel_of(ray)
+        assert np.hypot(column - 60, row - 30) < 5
+
     def test_an_even_view_favours_nothing(self):
         image = np.full((HEIGHT, WIDTH), 0.5)
         ray = dark_direction(CAMERA, grey(image), np.ones_like(image), np.full_like(image, 30.0), None)
@@ -104,6 +116,80 @@ class TestDarkDirection:
         image = 0.4 * light.falloff(torch.from_numpy(depth * DISTANCE_PER_DEPTH)).numpy()
         lit = lit_luminance(CAMERA, grey(image).astype(np.float64), depth, depth > 0, light)
         np.testing.assert_allclose(lit, 0.4, rtol=1e-5)
+
+    def test_spread_and_response_of_a_light_are_undone_too(self) -> None:
+        """Against the light's formulas, written out; channels are weighed as in Rec. 709."""
+        light = NearFieldLight(
+            torch.tensor(-1.5),
+            torch.tensor(0.9).log(),
+            torch.zeros(1),
+            25.0,
+            spread=torch.tensor(0.8),
+            log_shoulder=torch.tensor(-0.4),
+        )
+        depth = np.random.default_rng(0).uniform(20, 60, (HEIGHT, WIDTH))
+        distance, shoulder, softening = depth * DISTANCE_PER_DEPTH, np.exp(-0.4), np.exp(-1.5)
+        gain = ((1 + softening) / ((distance / 25) ** 2 + softening)) ** 0.9 * DISTANCE_PER_DEPTH**-0.8
+        signal = 0.6 * gain
+        image = (1 + shoulder) * signal / (1 + shoulder * signal)
+        colour = np.array([1.3, 0.9, 1.1])
+        colour /= colour @ [0.2126, 0.7152, 0.0722]
+        # What is overexposed is as bright as an image can be.
+        brighter, signal = image.copy(), signal.copy()
+        brighter[5, 7], signal[5, 7] = 1.7, 1.0
+        lit = lit_luminance(CAMERA, brighter[..., None] * colour, depth, depth > 0, light) * gain / signal
+        # The light's parameters are of single precision.
+        np.testing.assert_allclose(lit, 1.0, rtol=20 * np.finfo(np.float32).eps)
+
+    @pytest.mark.parametrize(
+        ("slope", "divided"), [(-1.3, -1.3), (-2.0, -2.0), (-3.5, -2.0), (0.0, 0.0), (0.7, 0.0)]
+    )
+    def test_without_a_light_what_falls_off_like_one_is_divided_out(
+        self, slope: float, divided: float
+    ) -> None:
+        """By a power of the distance, no steeper than light can fall, and never one that rises."""
+        generator = np.random.default_rng(1)
+        depth = generator.uniform(20, 60, (HEIGHT, WIDTH))
+        distance = depth * DISTANCE_PER_DEPTH
+        image = 0.4 * (distance / 40) ** slope
+        # Neither holes nor what is black tell anything of the light.
+        valid = ~disc(20, 20, 9)
+        usable = valid & ~disc(55, 40, 9)
+        image[~valid], depth[~valid] = 7.0, 3.0
+        image[valid & ~usable] = 1e-4
+        lit = lit_luminance(CAMERA, np.repeat(image[..., None], 3, axis=2), depth, valid, None)
+        mean = np.exp(np.log(distance[usable]).mean())
+        expected = np.where(valid, image / (distance / mean) ** divided, 0)
+        np.testing.assert_allclose(lit, expected, rtol=1e-10)
+
+    @pytest.mark.parametrize("unit", [1.0, 2.0**-10])
+    @pytest.mark.parametrize("seed", range(4))
+    def test_the_patch_is_that_of_a_search_through_all(self, seed: int, unit: float) -> None:
+        generator = np.random.default_rng(seed)
+        width, height = 34, 21
+        K = np.array([[[17.0, 0, 15.5], [0, 18.0, 11.2], [0, 0, 1]]])
+        pose = look_at(np.array([1.0, 2, 3]), generator.normal(size=3), np.array([0.0, 1, 0]))
+        camera = Cameras(K, pose[None], width, height)
+        # Without a fall-off that could be fitted: every surface is equally far.
+        depth = unit * 30 / np.linalg.norm(pixel_rays(camera)[0], axis=-1)
+        image = generator.uniform(0.3, 0.7, (height, width))
+        image[4:9, 6:13] *= 0.3
+        image[12:19, 20:26] *= 0.25
+        alpha = np.where(generator.random((height, width)) < 0.3, 0.2, 1.0)
+        alpha[11:16, 19:25] = 0.2
+        # 34 * 15 / 160 is 3.2 px: 3 px.
+        means = {}
+        for row in range(1, height - 1):
+            for column in range(1, width - 1):
+                patch = slice(row - 1, row + 2), slice(column - 1, column + 2)
+                solid = alpha[patch] == 1
+                if solid.sum() >= 4.5:
+                    means[row, column] = image[patch][solid].mean()
+        row, column = min(means, key=means.__getitem__)
+        assert means[row, column] < 0.7 * np.median(image[alpha == 1])
+        ray = dark_direction(camera, np.repeat(image[..., None], 3, axis=2), alpha, depth, None)
+        assert np.linalg.norm(ray) == pytest.approx(1)
+        assert pixel_of(ray, camera) == pytest.approx((column + 0.5, row + 0.5), abs=1e-9)
 
 
 class TestIlluminationWeight:

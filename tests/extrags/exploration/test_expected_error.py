@@ -7,12 +7,20 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation, Slerp
 
 from extrags.cameras import Cameras, rotation_about, rotation_angle_deg
 from extrags.exploration import Exploration, explore
 from extrags.exploration.approach import Approaches, straight_way
 from extrags.exploration.expected_error import Sizes, measure_sizes, probe_cameras
-from extrags.exploration.measurements import Destinations, SceneMeasurements, frontier_of, measure_scene
+from extrags.exploration.measurements import (
+    Destinations,
+    SceneMeasurements,
+    _fit_to_be_views,
+    frontier_of,
+    measure_scene,
+)
+from extrags.exploration.observation import Observation
 from extrags.exploration.search import Branch, SearchContext, grow_branch, prepare_search
 from extrags.exploration.seen import ErrorValue, PairValue, Seen, Value, union
 from extrags.freespace import FREE, OCCUPIED, FreeSpace, carve
@@ -143,6 +151,80 @@ class TestProbes:
         assert probes.centers[:, 0].max() < 0
         assert np.linalg.norm(probes.centers - pose[:3, 3], axis=1).max() > 3
 
+    def in_the_open(self, rotation: np.ndarray, scale: float, **changes: object) -> tuple[Cameras, Cameras]:
+        """Three training views far from every wall, and their probes; the world is turned and scaled."""
+        free = np.full((12, 12, 12), FREE, np.uint8)
+        poses = np.tile(np.eye(4), (3, 1, 1))
+        poses[:, :3, :3] = rotation @ Rotation.random(3, random_state=np.random.default_rng(5)).as_matrix()
+        poses[:, :3, 3] = scale * np.array([[1.0, 0, 0], [0, 2, -1], [-1, 1, 3]]) @ rotation.T + [7.0, -40, 3]
+        origin = np.array([7.0, -40, 3]) - 60 * scale * rotation @ np.ones(3)
+        clearance = np.full(free.shape, 50 * scale, np.float32)
+        space = FreeSpace(free, origin, rotation.T.copy(), 10 * scale, clearance)
+        K = np.tile(np.array([[20.0, 0, 16], [0, 20.0, 12], [0, 0, 1]]), (3, 1, 1))
+        cameras = Cameras(K, poses, 32, 24)
+        config = error_config(**{"probe_views": 90, "probe_shift": 0.5, "probe_turn_deg": 40.0} | changes)
+        return cameras, probe_cameras(cameras, space, 12.0 * scale, 1.0 * scale, config)
+
+    def test_shifts_and_turns_are_even_up_to_their_limits(self) -> None:
+        cameras, probes = self.in_the_open(np.eye(3), 1.0)
+        which = np.repeat(np.arange(3), 30)
+        np.testing.assert_array_equal(probes.K, cameras.K[which])
+        shift = np.linalg.norm(probes.centers - cameras.centers[which], axis=1) / (0.5 * 12)
+        start = cameras.world_from_camera[which, :3, :3]
+        turn = rotation_angle_deg(probes.world_from_camera[:, :3, :3], start) / 40
+        for share in (shift, turn):
+            assert share.max() <= 1 + 1e-12
+            # Of 90 even draws between 0 and 1; the deviations of both bounds are five of the mean's.
+            assert share.mean() == pytest.approx(0.5, abs=5 / np.sqrt(12 * 90))
+            assert share.max() > 0.9
+        # In the camera's own frame every direction is as likely as any other.
+        side = np.einsum("nji,nj->ni", start, probes.centers - cameras.centers[which])
+        assert np.abs((np.sign(side)).mean(axis=0)).max() < 5 / np.sqrt(90)
+
+    def test_limits_scale_what_is_drawn(self) -> None:
+        cameras, probes = self.in_the_open(np.eye(3), 1.0)
+        _, twice = self.in_the_open(np.eye(3), 1.0, probe_shift=1.0, probe_turn_deg=80.0)
+        which = np.repeat(np.arange(3), 30)
+        moved = np.linalg.norm(probes.centers - cameras.centers[which], axis=1) > 0.24
+        np.testing.assert_allclose(
+            (twice.centers - cameras.centers[which])[moved],
+            2 * (probes.centers - cameras.centers[which])[moved],
+            atol=1e-12,
+        )
+        start = cameras.world_from_camera[which, :3, :3]
+        np.testing.assert_allclose(
+            rotation_angle_deg(twice.world_from_camera[:, :3, :3], start),
+            2 * rotation_angle_deg(probes.world_from_camera[:, :3, :3], start),
+            atol=1e-5,
+        )
+
+    def test_move_with_the_world(self) -> None:
+        turn = rotation_about(np.array([1.0, -2, 0.5]), 1.1)
+        _, probes = self.in_the_open(np.eye(3), 1.0)
+        _, moved = self.in_the_open(turn, 3.0)
+        origin = np.array([7.0, -40, 3])
+        np.testing.assert_allclose(
+            moved.centers - origin, 3 * (probes.centers - origin) @ turn.T, rtol=0, atol=1e-11
+        )
+        np.testing.assert_allclose(
+            moved.world_from_camera[:, :3, :3], turn @ probes.world_from_camera[:, :3, :3], atol=1e-13
+        )
+
+    def test_are_shifted_by_a_fiftieth_of_the_depth_or_not_at_all(self) -> None:
+        """Also where a wall is so near that the shift is halved again and again."""
+        occupancy = np.full((16, 16, 16), FREE, np.uint8)
+        occupancy[8:] = OCCUPIED
+        space = FreeSpace(occupancy, np.full(3, -8.0), np.eye(3), 1.0, np.ones((16, 16, 16), np.float32))
+        pose = np.eye(4)
+        pose[0, 3] = -0.2
+        config = error_config(probe_shift=1.0, probe_views=200)
+        probes = probe_cameras(square_camera(pose), space, 6.0, 0.1, config)
+        shift = np.linalg.norm(probes.centers - pose[:3, 3], axis=1)
+        assert probes.centers[:, 0].max() < 0
+        assert np.all((shift == 0) | (shift > 0.02 * 6 * (1 - 1e-12)))
+        assert np.any(shift == 0)
+        assert np.any((shift > 0) & (shift < 0.04 * 6))
+
     def test_another_seed_gives_others(self):
         first, second = context().measured, context(seed=1).measured
         assert not np.array_equal(first.destinations.poses, second.destinations.poses)
@@ -185,6 +267,63 @@ class TestMeasureScene:
             for masks in (None, [mask] * len(cameras))
         )
         np.testing.assert_array_equal(plain.known, masked.known)
+
+    def test_only_probes_that_could_be_virtual_views_are_destinations(self) -> None:
+        occupancy = np.full((6, 6, 6), FREE, np.uint8)
+        occupancy[3:] = OCCUPIED
+        # Two millimetres of room, but for one layer of voxels.
+        clearance = np.full(occupancy.shape, 2.0, np.float32)
+        clearance[2] = 1.9
+        space = FreeSpace(occupancy, np.zeros(3), np.eye(3), 1.0, clearance)
+        nothing = Sizes(np.zeros(0, np.int32), np.zeros(0, np.float32))
+
+        def probe(x: float, *, saturated: float = 0.0, rejected: bool = False) -> Observation:
+            pose = np.eye(4)
+            pose[:3, 3] = x, 2.5, 2.5
+            return Observation(
+                pose=pose,
+                visible=np.zeros(0, np.int32),
+                sizes=nothing,
+                holes=np.zeros((2, 2), bool),
+                depth_mm=np.ones(4, np.float32),
+                look_at_mm=1.0,
+                dark=np.zeros(3),
+                saturated_share=saturated,
+                rejected=rejected,
+            )
+
+        probes = [
+            probe(1.5),
+            probe(2.5),  # too near to the wall
+            probe(4.5),  # behind it
+            probe(0.5, rejected=True),
+            probe(0.5, saturated=0.2),
+            probe(0.5, saturated=0.21),  # too bright
+        ]
+        config = error_config(safety_share=0.2, max_saturated_share=0.2)
+        assert _fit_to_be_views(probes, space, 10.0, config) == [0, 4]
+        assert _fit_to_be_views(probes, space, 5.0, config) == [0, 1, 4]
+        none = config.model_copy(update={"destinations": False})
+        assert _fit_to_be_views(probes, space, 5.0, none) == []
+
+    def test_removable_error_is_what_is_not_known_yet(self) -> None:
+        measured = context().measured
+        assert isinstance(measured.value, ErrorValue)
+        known, error = measured.known.astype(np.float64), measured.value.error.astype(np.float64)
+        assert measured.removable_error == pytest.approx(sum((1 - known) * error), rel=1e-6)
+        assert context(score="pairs").measured.removable_error == 0
+
+    def test_virtual_views_have_the_usual_intrinsics(self) -> None:
+        """The median of the recording's, one by one: a frame that was zoomed into changes nothing."""
+        measured = context().measured
+        K = measured.training.K.copy()
+        K[0, 0, 0] *= 3
+        zoomed = replace(measured, training=replace(measured.training, K=K))
+        poses = measured.training.world_from_camera[:2]
+        found = zoomed.cameras(poses)
+        np.testing.assert_array_equal(found.K, measured.training.K[[1, 1]])
+        np.testing.assert_array_equal(found.world_from_camera, poses)
+        assert (found.width, found.height) == (measured.training.width, measured.training.height)
 
     def test_round_trip_on_disk(self, tmp_path):
         for ready in (context(), context(score="pairs")):
@@ -275,6 +414,44 @@ class TestApproaches:
         np.testing.assert_allclose(found, allowed[: len(found)], rtol=1e-12)
         assert len(found) == min(12, len(allowed))
 
+    def test_a_straight_way_turns_by_the_shortest_rotation(self) -> None:
+        """From anywhere, in any direction: along the great circle between both orientations."""
+        generator = np.random.default_rng(8)
+        for _ in range(5):
+            start, end = np.eye(4), np.eye(4)
+            for pose in (start, end):
+                pose[:3, :3] = Rotation.random(random_state=generator).as_matrix()
+                pose[:3, 3] = generator.normal(size=3)
+            both = Slerp([0, 1], Rotation.from_matrix(np.stack([start[:3, :3], end[:3, :3]])))
+            poses = straight_way(start, end, 3)
+            share = np.array([1 / 3, 2 / 3, 1])
+            np.testing.assert_allclose(poses[:, :3, :3], both(share).as_matrix(), atol=1e-13)
+            centers = (1 - share[:, None]) * start[:3, 3] + share[:, None] * end[:3, 3]
+            np.testing.assert_allclose(poses[:, :3, 3], centers, atol=1e-14)
+            np.testing.assert_array_equal(poses[:, 3], [[0, 0, 0, 1]] * 3)
+
+    @pytest.mark.parametrize(
+        ("turn_deg", "distance", "views"),
+        [(50, 0.1, 3), (40, 0.1, 2), (41, 0.1, 3), (0, 0.0, 1), (5, 5.0, 2), (30, 5.01, 3), (170, 3.0, 9)],
+    )
+    def test_a_way_has_as_many_views_as_its_steps_and_its_turns_need(
+        self, turn_deg: float, distance: float, views: int
+    ) -> None:
+        start, end = np.eye(4), np.eye(4)
+        start[:3, :3] = rotation_about(np.array([1.0, 2, -1]), 0.7)
+        start[:3, 3] = [5.0, -3, 2]
+        end[:3, :3] = start[:3, :3] @ rotation_about(np.array([0.0, 1, 3]), np.radians(turn_deg))
+        end[:3, 3] = start[:3, 3] + distance * np.array([0.6, 0, 0.8])
+        seen = Seen(np.arange(2, dtype=np.int32), np.array([0.5, 1], np.float32))
+        value = ErrorValue(np.array([4.0, 6], np.float32))
+        known = np.zeros(2, np.float32)
+        approaches = Approaches(Destinations.of(end[None], [seen]), value, known, step_mm=2.5, turn_deg=20.0)
+        ((rate, poses),) = approaches.better(start, known, views, 0.0)
+        assert rate == pytest.approx(8 / views)
+        np.testing.assert_allclose(poses, straight_way(start, end, views), atol=1e-12)
+        # One view less than it takes is too few to get there.
+        assert list(approaches.better(start, known, views - 1, 0.0)) == []
+
     def test_a_straight_way_arrives_in_equal_steps(self):
         start, end = np.eye(4), np.eye(4)
         end[:3, :3] = rotation_about(np.array([0.0, 1.0, 0.0]), 1.2)
@@ -289,7 +466,6 @@ class TestApproaches:
 def moved_tube(tube: Tube, space: FreeSpace, scale: float, turn: np.ndarray) -> tuple[Tube, FreeSpace]:
     """The same world, scaled, turned and shifted."""
     import torch
-    from scipy.spatial.transform import Rotation
 
     shift = np.array([30.0, -7.0, 12.0])
     g = tube.scene.gaussians

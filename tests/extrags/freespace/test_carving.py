@@ -48,6 +48,27 @@ class TestLookup:
         np.testing.assert_array_equal(space.lookup(space.voxel_centers()), occupancy.ravel())
         np.testing.assert_allclose(space.clearance_at(space.voxel_centers()), np.arange(216), atol=1e-3)
 
+    def test_the_free_share_is_that_of_all_voxels(self) -> None:
+        occupancy = np.full((5, 5, 5), UNKNOWN, np.uint8)
+        occupancy[1:3, 2, :4] = FREE
+        assert made_space(occupancy).free_share == 8 / 125
+
+    def test_clearance_is_linear_between_centres_and_never_negative(self) -> None:
+        """Against the eight corners, weighed by hand; half a voxel from the faces it stays as it is."""
+        generator = np.random.default_rng(3)
+        space = made_space(np.zeros((6, 6, 6), np.uint8))
+        space = replace(space, clearance=generator.uniform(-1, 3, (6, 6, 6)).astype(np.float32))
+        grid = generator.uniform(0, 6, (200, 3))
+        expected = np.zeros(200)
+        for n, at in enumerate(np.clip(grid - 0.5, 0, 5)):
+            low = np.minimum(np.floor(at).astype(int), 4)
+            for corner in np.ndindex(2, 2, 2):
+                weight = np.prod(np.where(corner, at - low, 1 - (at - low)))
+                expected[n] += weight * space.clearance[tuple(low + corner)]
+        assert (expected < 0).any()
+        found = space.clearance_at(space.from_grid(grid))
+        np.testing.assert_allclose(found, np.maximum(expected, 0), atol=8 * np.finfo(np.float32).eps)
+
     def test_outside_is_unknown(self):
         space = made_space(np.zeros((6, 6, 6), np.uint8))
         outside = space.origin_mm + np.array([[-0.01, 1, 1], [1, 12.01, 1], [1, 1, 500]]) @ AXES
@@ -94,6 +115,25 @@ class TestSegments:
         centers = space.voxel_centers().reshape(8, 8, 8, 3)
         assert space.segment_is_free(centers[0, 0, 0], centers[3, 7, 7])
         assert not space.segment_is_free(centers[0, 0, 0], centers[7, 0, 0])
+
+    @pytest.mark.parametrize("axis", range(3))
+    @pytest.mark.parametrize("slant", [0.0, 0.3])
+    def test_one_voxel_stops_a_segment_alone_from_either_side(self, axis: int, slant: float) -> None:
+        """Alone: among many, the longest one decides how finely all of them are cut."""
+        start = np.full(3, 2.5)
+        for steps in (1, 2, 4):
+            end = start + slant * steps / 4
+            end[axis] = start[axis] + steps
+            for wall in range(7):
+                occupancy = np.full((7, 7, 7), FREE, np.uint8)
+                where = [2, 2, 2]
+                where[axis] = wall
+                occupancy[tuple(where)] = OCCUPIED
+                space = made_space(occupancy)
+                a, b = space.from_grid(start), space.from_grid(end)
+                expected = not 2 <= wall <= 2 + steps
+                assert bool(space.segment_is_free(a, b)) == expected
+                assert bool(space.segment_is_free(b, a)) == expected
 
     def test_a_point_is_a_segment(self):
         occupancy = np.zeros((4, 4, 4), np.uint8)

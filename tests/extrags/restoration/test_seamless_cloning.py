@@ -24,6 +24,7 @@ from extrags.restoration.protocol import Clip, keeps_known
 from extrags.restoration.training_data.pairs import Pairs
 from extrags.restoration.uncertainty import calibration
 from extrags.restoration.uncertainty.calibration import Calibration
+from extrags.view_synthesis.conditioning import LAYER_CHANNELS, Layers
 from tests.extrags.lit_tube import Tube
 from tests.extrags.restoration.conftest import SMALL
 
@@ -69,6 +70,19 @@ class TestCloning:
         rgb = torch.rand(1, 3, *SIZE, generator=torch.Generator().manual_seed(2))
         found = cloned_seamlessly(rgb, torch.full_like(rgb, 0.5), torch.zeros(1, 1, *SIZE))
         torch.testing.assert_close(found, rgb)
+
+
+def test_certain_is_what_views_or_the_rendering_give_less_their_uncertainty() -> None:
+    """Where a real view covers a share w of a pixel, the rendering counts for the rest of it."""
+    generator = torch.Generator().manual_seed(3)
+    data = torch.rand(2, LAYER_CHANNELS, *SIZE, generator=generator)
+    layers = Layers(data)
+    layers.get("uncertainty")[0, :, :4] = 1.3  # an estimate may exceed one
+    found = certainty(layers).double()
+    weight, alpha, off = (layers.get(name).double() for name in ("blend_weight", "alpha", "uncertainty"))
+    expected = (1 - (1 - weight) * (1 - alpha)) * torch.where(off < 1, 1 - off, 0.0)
+    assert not found[0, :, :4].any()
+    torch.testing.assert_close(found, expected, rtol=0, atol=4 * torch.finfo(torch.float32).eps)
 
 
 def shifting(trained: EmbeddedEnhancer) -> EmbeddedEnhancer:

@@ -389,6 +389,24 @@ class TestKeptScene:
         for name, values in scene.light.detached().parameters().items():
             assert torch.equal(result.scene.light.parameters()[name], values), name
 
+    def test_their_number_stays(
+        self, scene: Scene, sequence: EndoscopicSequence, pseudo: PseudoViews, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """Gaussians of the scene are known by their places, which a density step would change."""
+        asked: list[Schedule] = []
+
+        def recorded(start: Scene, draw: object, schedule: Schedule, **_: object) -> TrainingResult:
+            asked.append(schedule)
+            return TrainingResult(start, [])
+
+        monkeypatch.setattr("extrags.training.finetuning.optimise", recorded)
+        holes = replace(pseudo, alpha=np.zeros_like(pseudo.alpha))
+        dense = COARSE.model_copy(update={"densify": DensifyConfig(enabled=True)})
+        for keep_scene in (False, True):
+            config = config_of("paper", growth=1.3, seed_holes=True, keep_scene=keep_scene)
+            finetune(scene, sequence, holes, config, dense)
+        assert [schedule.densify.enabled for schedule in asked] == [True, False]
+
     @pytest.mark.parametrize("virtual", [True, False])
     def test_without_new_gaussians_nothing_is_done(
         self, scene: Scene, sequence: EndoscopicSequence, pseudo: PseudoViews, virtual: bool

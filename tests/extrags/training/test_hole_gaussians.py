@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from extrags.gaussians import Gaussians
 from extrags.illumination import NearFieldLight
@@ -100,8 +101,63 @@ class TestSurfaceThatFramesSaw:
         assert (found[:, 20:] > 0).mean() > 0.9
 
 
+class TestCells:
+    def test_points_of_a_cell_are_averaged_with_their_colours(self) -> None:
+        """Cells are counted from the lowest corner, wherever the points lie."""
+        generator = np.random.default_rng(0)
+        points = generator.uniform(-7, 9, (200, 3)) + np.array([40.0, -60, 3])
+        rgb = generator.random((200, 3))
+        found, colours = placing._one_per_cell(points, rgb, 4.0)
+        cells: dict[tuple[float, ...], list[int]] = {}
+        for index, point in enumerate(points):
+            cells.setdefault(tuple((point - points.min(axis=0)) // 4.0), []).append(index)
+        assert 20 < len(cells) < 100
+        order = sorted(cells)
+        expected = np.array([points[cells[cell]].mean(axis=0) for cell in order])
+        means = np.array([rgb[cells[cell]].mean(axis=0) for cell in order])
+        apart, which = cKDTree(expected).query(found)
+        assert apart.max() < 1e-12
+        assert sorted(which.tolist()) == list(range(len(order)))
+        np.testing.assert_allclose(colours, means[which], rtol=1e-12)
+
+    def test_spacing_is_that_of_most_gaussians(self) -> None:
+        """One and a half times the way to the nearest neighbour; floaters and clusters say nothing."""
+        lattice = 2.0 * np.argwhere(np.ones((5, 5, 5)))
+        floaters = np.array([[1e4 * k, 0, 0] for k in range(1, 20)])
+        cluster = np.array([-50.0, 0, 0]) + 1e-3 * np.argwhere(np.ones((2, 3, 3)))
+        points = np.concatenate([lattice, floaters, cluster])
+        gaussians = Gaussians.from_points(points, np.full(points.shape, 0.5), np.full(len(points), 1.0))
+        assert placing._typical_spacing(gaussians) == pytest.approx(3.0, rel=1e-6)
+
+
 class TestHoleGaussians:
     ROOM = 10_000
+
+    @pytest.mark.usefixtures("real_views_carve_alone")
+    @pytest.mark.parametrize("thickness", [1.0, 0.1])
+    def test_lie_flat_on_the_surface(
+        self, sequence: EndoscopicSequence, pseudo: PseudoViews, holes: np.ndarray, thickness: float
+    ) -> None:
+        holes[1:] = False
+        blind = replace(sequence, mask=np.zeros_like(sequence.mask))
+        # A slanted plane n x = d before the first camera.
+        n, d = np.array([0.3, -0.2, 0.9]) / math.sqrt(0.94), 14.0
+        K = pseudo.cameras.K[0]
+        v, u = np.mgrid[0:HEIGHT, 0:WIDTH] + 0.5
+        rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=-1)
+        views = wall_views(pseudo, np.repeat((d / (rays @ n))[None], 3, axis=0), holes)
+        new = hole_gaussians(wall_scene(None), blind, views, self.ROOM, thickness=thickness)
+        assert new is not None
+        scales = np.sort(new.scales.double().exp().numpy(), axis=1)
+        np.testing.assert_allclose(scales[:, 1], scales[:, 2], rtol=1e-5)
+        np.testing.assert_allclose(scales[:, 0], thickness * scales[:, 1], rtol=1e-5)
+        np.testing.assert_allclose(torch.sigmoid(new.opacities), 0.3, rtol=1e-5)
+        if thickness != 1:
+            axes = Rotation.from_quat(new.quats.double().numpy()[:, [1, 2, 3, 0]]).as_matrix()
+            thin = axes[np.arange(len(new)), :, new.scales.argmin(dim=1).numpy()]
+            normal = pseudo.cameras.world_from_camera[0, :3, :3] @ n
+            # Depths are of single precision, and neighbours 0.6 mm apart at 14 mm.
+            np.testing.assert_allclose(np.abs(thin @ normal), 1, atol=1e-5)
 
     @pytest.mark.usefixtures("real_views_carve_alone")
     def test_lie_at_the_restored_depth_along_their_rays(
@@ -338,6 +394,55 @@ class TestHoleGaussians:
             views = wall_views(pseudo, np.full(holes.shape, z), holes)
             found = hole_gaussians(wall_scene(None), far, views, self.ROOM)
             assert (found is not None) == some
+
+    def test_the_unit_of_length_does_not_matter(
+        self, sequence: EndoscopicSequence, pseudo: PseudoViews, holes: np.ndarray
+    ) -> None:
+        """Metres, or whatever structure from motion found: a power of two changes no digit."""
+        known = replace(sequence, mask=np.ones_like(sequence.mask))
+        assert known.depth_mm is not None
+        assert known.world_from_camera is not None
+        known = replace(known, depth_mm=np.maximum(known.depth_mm, 40))
+        depth = np.random.default_rng(0).uniform(20, 60, holes.shape)
+        means = []
+        for scale in (1.0, 2.0**-10):
+            poses, virtual = known.world_from_camera.copy(), pseudo.cameras.world_from_camera.copy()
+            for array in (poses, virtual):
+                array[:, :3, 3] *= scale
+            points = wall_scene(None).gaussians.means.double().numpy() * scale
+            scene = Scene(
+                Gaussians.from_points(points, np.full((50, 3), 0.5), np.full(50, 1e-3 * scale)), None
+            )
+            views = wall_views(pseudo, depth * scale, holes)
+            new = hole_gaussians(
+                scene,
+                replace(known, world_from_camera=poses, depth_mm=known.depth_mm * np.float32(scale)),
+                replace(views, cameras=replace(pseudo.cameras, world_from_camera=virtual)),
+                self.ROOM,
+                max_distance=200 * scale,
+            )
+            assert new is not None
+            means.append(new.means / scale)
+        assert 20 < len(means[0]) < np.count_nonzero(holes[:, ::2, ::2])
+        torch.testing.assert_close(means[0], means[1], rtol=8 * torch.finfo(torch.float32).eps, atol=0)
+
+    @pytest.mark.usefixtures("real_views_carve_alone")
+    def test_of_far_holes_no_more_light_is_divided_out_than_a_twentieth(
+        self, sequence: EndoscopicSequence, pseudo: PseudoViews, holes: np.ndarray
+    ) -> None:
+        """A dark pixel far away would become a Gaussian that glows from nearby."""
+        holes[1:] = False
+        blind = replace(sequence, mask=np.zeros_like(sequence.mask))
+        target = np.full_like(pseudo.target, 0.02)
+        views = replace(wall_views(pseudo, np.full(holes.shape, 3000.0), holes), target=target)
+        light = tube_light()
+        new = hole_gaussians(wall_scene(light), blind, views, self.ROOM)
+        assert new is not None
+        signal = light.invert_response(torch.tensor(0.02, dtype=torch.float64))
+        albedo = 0.28209479177387814 * new.sh0[:, 0].double() + 0.5
+        # Colours are kept about one half, so the rounding is that of numbers as large.
+        tolerance = 4 * torch.finfo(torch.float32).eps
+        torch.testing.assert_close(albedo, (signal / 0.05).expand_as(albedo), rtol=0, atol=tolerance)
 
     def test_nothing_to_fill(self, sequence: EndoscopicSequence, pseudo: PseudoViews) -> None:
         none = wall_views(pseudo, np.full((3, HEIGHT, WIDTH), 20.0), np.zeros((3, HEIGHT, WIDTH), dtype=bool))
