@@ -14,9 +14,10 @@ OpenCV's axes, camera to world, in metres; depth is z-depth in PNG files of 16 b
 pixels, 5000 to a metre, 0 where unknown. Lengths become millimetres.
 
 A frame gets the pose and the depth nearest in time, at most 0.02 s away, each of which belongs to one frame
-at most, the nearest pairs first. Frames that lack one of them, as before the tracker began, are left out with
-a warning, and so are images that are listed and absent; where these are more than `ingest.max_absent_share`,
-the source is refused. Frames are in the order of time.
+at most, the nearest pairs first; of poses and depth at more than 100 Hz only the two before and the two after
+the frame. Frames that lack one of them, as before the tracker began, are left out with a warning, and so are
+images that are listed and absent; where these are more than `ingest.max_absent_share`, the source is refused.
+Frames are in the order of time.
 
 Source: Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012, and "File formats"
 and `associate.py` of its web page.
