@@ -15,7 +15,7 @@ from data_catalog.true_surface import true_surface
 from extrags.config import IngestConfig
 from extrags.errors import UnknownSequenceError
 from extrags.sequence import EndoscopicSequence
-from tests.data_catalog.true_depth import off_the_surface_mm
+from tests.data_catalog.two_recordings import check_the_same_again, off_the_surface_mm
 
 TINY = IngestConfig(width=32, max_frames=6)
 
@@ -46,14 +46,7 @@ def test_a_key_depends_on_what_is_rendered() -> None:
 
 
 def test_it_is_the_same_each_time_and_has_its_truth(sequence: EndoscopicSequence) -> None:
-    again = read("caverns/1@distanced", TINY)
-    np.testing.assert_array_equal(again.rgb, sequence.rgb)
-    assert sequence.rgb.shape[1:] == (26, 32, 3)
-    assert sequence.depth_mm is not None
-    assert sequence.observed is not None
-    assert (sequence.depth_mm > 0).all()
-    assert not sequence.observed[sequence.train].any()
-    assert 0.3 < sequence.observed[sequence.test].mean() < 1
+    check_the_same_again(sequence, TINY, (26, 32, 3))
     other = read("caverns/2@distanced", TINY)
     assert np.abs(other.rgb.astype(float) - sequence.rgb).mean() > 10
 

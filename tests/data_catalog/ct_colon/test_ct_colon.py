@@ -21,7 +21,7 @@ from data_catalog.true_surface import true_surface
 from extrags.config import IngestConfig
 from extrags.errors import SourceError, SourceNotFoundError, UnknownSequenceError
 from extrags.sequence import EndoscopicSequence
-from tests.data_catalog.true_depth import off_the_surface_mm
+from tests.data_catalog.two_recordings import check_the_same_again, off_the_surface_mm
 
 TINY = IngestConfig(width=32, max_frames=6)
 RADIUS_MM, LENGTH_MM = 12.0, 320.0
@@ -208,13 +208,7 @@ def test_a_damaged_line_is_named(tmp_path: Path, text: str) -> None:
 
 
 def test_it_is_the_same_each_time_and_has_its_truth(sequence: EndoscopicSequence) -> None:
-    again = read("ct_colon/1@distanced", TINY)
-    np.testing.assert_array_equal(again.rgb, sequence.rgb)
-    assert sequence.rgb.shape[1:] == (26, 32, 3)
-    assert sequence.depth_mm is not None
-    assert sequence.observed is not None
-    assert (sequence.depth_mm > 0).all()
-    assert 0.3 < sequence.observed[sequence.test].mean() < 1
+    check_the_same_again(sequence, TINY, (26, 32, 3))
     # Red, as tissue is, and exposed to be seen.
     red, green, blue = sequence.rgb.mean(axis=(0, 1, 2))
     assert red > 1.2 * max(green, blue)
