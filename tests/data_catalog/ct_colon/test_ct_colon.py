@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -223,6 +224,20 @@ def test_depth_lies_on_the_true_surface(sequence: EndoscopicSequence, real: Path
     np.testing.assert_array_equal(truth.mesh.vertices, wall.vertices)
     rays = RayCaster(wall.vertices, wall.triangles)
     assert off_the_surface_mm(sequence, 4, rays).max() < 1e-2
+
+
+def test_no_other_surface_takes_the_place_of_one_that_is_gone(
+    sequence: EndoscopicSequence, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("EXTRAGS_DATA", "XDG_DATA_HOME", "XDG_CACHE_HOME"):
+        monkeypatch.setenv(name, str(tmp_path))
+    # An object of its own: who asked for that of the same one has it already.
+    with pytest.raises(SourceNotFoundError, match="the surface of ct_colon/1@distanced is not"):
+        true_surface(replace(sequence))
+    estimated = replace(sequence, truth={**sequence.truth, "world": "estimated"})
+    fused = true_surface(estimated)
+    assert fused is not None
+    assert fused.kind == "depth"
 
 
 @pytest.mark.parametrize("scene", [0, 2])
