@@ -33,7 +33,7 @@ def leaderboard(given: argparse.Namespace) -> int:
     """`extrags leaderboard`.
 
     Raises:
-        StoreError: when there is no such store, no such run, or the page cannot be written.
+        StoreError: when there is no such store, no run of one of the patterns, or the page cannot be written.
     """
     set_up_logging(debug=given.debug, terminal=True, quiet=given.quiet)
     store = existing_store(given)
@@ -41,9 +41,11 @@ def leaderboard(given: argparse.Namespace) -> int:
     from flows.recorded_runs import board_rows, nearest_on_record
 
     rows = board_rows(store, given.patterns, given.output)
-    if not rows:
-        wanted = f" of {', '.join(given.patterns)}" if given.patterns else ""
-        near = nearest_on_record(store, given.patterns)
+    # One by one: a page without a sequence that was asked for would pass for one with all of them.
+    absent = [pattern for pattern in given.patterns if not board_rows(store, [pattern])]
+    if absent or not rows:
+        wanted = f" of {', '.join(absent)}" if absent else ""
+        near = nearest_on_record(store, absent)
         raise StoreError(f"no run{wanted} is on record in {store.root}{near}")
     print(write_page(build_leaderboard(rows, name=given.name), given.output))
     return 0

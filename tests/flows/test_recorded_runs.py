@@ -141,6 +141,20 @@ def test_a_misspelt_sequence_is_answered_with_the_nearest(
     assert f"; did you mean {SEQUENCE}?" in capsys.readouterr().err
 
 
+def test_a_leaderboard_lacks_no_sequence_in_silence(
+    store: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = tmp_path / "board.html"
+    misspelt = SEQUENCE.replace("phantom", "phamtom")
+    given = ["--store", store.root, "--output", str(page)]
+    assert main(["leaderboard", SEQUENCE, misspelt, *given]) != 0
+    assert f"no run of {misspelt} is on record" in (told := capsys.readouterr().err)
+    assert f"; did you mean {SEQUENCE}?" in told
+    assert not page.exists()
+    assert main(["leaderboard", SEQUENCE, "phantom/*", *given]) == 0
+    assert page.exists()
+
+
 def test_rows_of_the_leaderboard(store: Store) -> None:
     rows = board_rows(store)
     assert [(row.method, row.status) for row in rows] == [
