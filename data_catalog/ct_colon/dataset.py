@@ -13,6 +13,7 @@ from data_catalog.dataset import Descriptor, Source, file_digests
 from data_catalog.named_folders import find_folder, not_on_this_machine
 from data_catalog.rendered_dataset import RenderedDataset
 from extrags.config import IngestConfig
+from extrags.errors import SourceNotFoundError
 from extrags.sequence import EndoscopicSequence
 
 __all__ = ["CT_COLON"]
@@ -39,13 +40,21 @@ class CtColonDataset(RenderedDataset[CtColonConfig]):
         return source.model_copy(update={"paths": tuple(paths)})
 
     def fingerprint(self, source: Source, config: IngestConfig) -> dict[str, Any]:
-        """Settings, version of the generator and content of the files."""
+        """Settings, version of the generator and content of the files.
+
+        Raises:
+            SourceNotFoundError: a file of the model is missing.
+            SourceError: there are no frames.
+        """
         model, frames = map(Path, source.paths)
         names = (SURFACE_FILE.format(triangles="100k"), PATH_FILE)
         listed = [
             *((name, model / name) for name in names),
             *((file.name, file) for file in judging_files(frames)),
         ]
+        missing = next((file for _, file in listed if not file.is_file()), None)
+        if missing is not None:
+            raise SourceNotFoundError("no such file, which the colon's model has", file=missing)
         return {**super().fingerprint(source, config), "files": file_digests(listed)}
 
     def record(self, config: CtColonConfig, source: Source) -> EndoscopicSequence:

@@ -40,7 +40,8 @@ def build_stretch(scene: int, folder: Path) -> Passage:
         folder: of the model (`data_catalog.ct_colon.model`).
 
     Raises:
-        SourceError: a file is missing or wrong, or the colon is shorter than a stretch.
+        SourceError: a file is missing or wrong, the colon is shorter than a stretch, or none of the wall lies
+            around the line.
     """
     model = ColonModel.read(folder)
     along = model.along_mm
@@ -82,6 +83,10 @@ def _wall(model: ColonModel, begin_mm: float, end_mm: float) -> Wall:
     _, nearest = cKDTree(model.centre_line_mm).query(model.vertices)
     place = model.along_mm[nearest]
     kept = ((place >= begin_mm) & (place <= end_mm))[model.triangles].all(axis=1)
+    if not kept.any():
+        raise SourceError(
+            "no wall lies around the line between its ends; are both of one colon?", field="points"
+        )
     used, triangles = np.unique(model.triangles[kept], return_inverse=True)
     vertices = model.vertices[used].astype(np.float64)
     vertices, triangles = _divided(vertices, triangles.reshape(-1, 3))

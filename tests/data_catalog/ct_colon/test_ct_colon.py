@@ -122,6 +122,9 @@ def test_the_key_depends_on_settings_and_files(tmp_path: Path, monkeypatch: pyte
     assert another != plain
     (folder / PATH_FILE).write_text(json.dumps({"points": [[0, 0, 0], [1, 0, 0]]}))
     assert source_fingerprint("ct_colon/3") not in (plain, another)
+    (folder / PATH_FILE).unlink()
+    with pytest.raises(SourceNotFoundError, match=r"large_intestine_path\.jsn: no such file"):
+        source_fingerprint("ct_colon/3")
 
 
 def test_frames_for_judging_are_those_that_training_does_not_take(tmp_path: Path) -> None:
@@ -155,6 +158,15 @@ def test_a_stretch_is_part_of_the_wall_with_normals_inwards(tmp_path: Path) -> N
 def test_a_colon_that_is_too_short_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="the line is 119 mm long; a stretch takes 110"):
         build_stretch(0, _write_tube(tmp_path / "model", 120.0))
+
+
+def test_a_line_of_another_colon_is_refused(tmp_path: Path) -> None:
+    folder = _write_tube(tmp_path / "model")
+    # The ends of the line alone are near the wall.
+    aside = [[float(x), 1000.0 if 1 < x < LENGTH_MM - 1 else 0.0, 0.0] for x in range(int(LENGTH_MM) + 1)]
+    (folder / PATH_FILE).write_text(json.dumps({"points": aside}))
+    with pytest.raises(SourceError, match="no wall lies around the line"):
+        build_stretch(0, folder)
 
 
 def _without_points(text: str) -> str:
