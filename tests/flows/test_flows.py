@@ -76,9 +76,11 @@ class TestSequence:
         assert states(failure.outcome)["ingest"] == "failed"
         assert Store(tmp_path / "store").ls() == []
 
+    @pytest.mark.usefixtures("shared_data")
     def test_a_refusal_advises_nothing_that_the_method_sets(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
+        """The method needs weights of LPIPS, which are looked for before the memory."""
         monkeypatch.setattr("flows.memory_limit.usable_cores", lambda: 2)
         with pytest.raises(
             SequenceFailedError, match=r"it fits with --enhance\.max_views \d+ --ingest\.width"
