@@ -53,11 +53,11 @@ def build_stretch(scene: int, folder: Path) -> Passage:
     return Passage(_wall(model, begin - _BEYOND_MM, begin + STRETCH_MM + _BEYOND_MM), _smoothed_line(middle))
 
 
-def make_lining(scene: int, wall: Wall, folder: Path | None = None) -> Skin:
+def make_lining(seed: int, wall: Wall, folder: Path | None = None) -> Skin:
     """Real tissue on a wall.
 
     Args:
-        scene: which; the seed of everything random.
+        seed: of everything random (`CtColonConfig.seed`).
         wall: to line.
         folder: that holds the frames; None looks below the data roots.
 
@@ -65,7 +65,7 @@ def make_lining(scene: int, wall: Wall, folder: Path | None = None) -> Skin:
         SourceNotFoundError: when there is no such folder.
         SourceError: when none of the frames drawn shows tissue alone.
     """
-    files, rng = judging_files(folder), stream(scene, "texture")
+    files, rng = judging_files(folder), stream(seed, "texture")
     tiles = (photographed_tile(files, rng) for _ in range(_TILES))
     tile = next((tile for tile in tiles if tile is not None), None)
     if tile is None:
