@@ -92,12 +92,11 @@ def other_readings(
     """
     open_gl, open_cv = np.diag([1.0, -1.0, -1.0]), np.eye(3)
     usual = [(open_cv, True), (open_gl, False), (open_gl, True)]
-    known = [*usual, (open_cv, False)]
     others = [
         (axes, inverted)
         for axes in _axis_rotations()
         for inverted in (False, True)
-        if not any(inverted == way and np.array_equal(axes, other) for other, way in known)
+        if not any(np.array_equal(axes, common) for common in (open_cv, open_gl))
     ]
     inverses = invert_poses(poses)
     for axes, inverted in [*usual, *others]:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import inspect
+
 import numpy as np
 import pytest
 import torch
 
-from extrags.errors import ConfigError
+from extrags.errors import ConfigError, ShapeError
 from extrags.metrics.flip import PIXELS_PER_DEGREE, flip, flip_map
 
 
@@ -96,3 +98,11 @@ def test_mask_and_bad_resolution() -> None:
     assert flip(clean, other, mask) == pytest.approx(float(flip_map(clean, other)[:, :10].mean()), abs=1e-6)
     with pytest.raises(ConfigError, match="positive"):
         flip_map(clean, other, pixels_per_degree=0.0)
+
+
+@pytest.mark.parametrize(("first", "second"), [((8, 9, 3), (9, 8, 3)), ((8, 9, 4), (8, 9, 4))])
+def test_images_of_other_shapes_are_refused(first: tuple[int, ...], second: tuple[int, ...]) -> None:
+    # Users have no checks of shapes around it, as these tests do.
+    plain = inspect.unwrap(flip_map)
+    with pytest.raises(ShapeError, match="FLIP compares images"):
+        plain(torch.zeros(first), torch.zeros(second))
