@@ -16,13 +16,7 @@ import pytest
 from PIL import Image
 
 from data_catalog.catalog import read, resolve, source_fingerprint
-from data_catalog.readers.colmap_files import (
-    ColmapImage,
-    ColmapModel,
-    read_image_names,
-    read_model,
-    write_model,
-)
+from data_catalog.readers.colmap_files import ColmapImage, ColmapModel, read_model, write_model
 from data_catalog.readers.colmap_model import model_folder, points_of, read_depth_map, write_colmap
 from extrags.config import IngestConfig
 from extrags.errors import SourceError
@@ -380,30 +374,6 @@ class TestNames:
         rename_images(workspace, lambda name: name.replace("0007", "./0008"))
         with pytest.raises(SourceError, match=r"images\.bin, frame .*0008\.png, field name: .*listed twice"):
             read(workspace)
-
-
-@pytest.mark.parametrize("binary", [True, False])
-class TestFiles:
-    def test_an_image_listed_twice_is_refused(self, workspace, tmp_path, binary) -> None:
-        model = read_model(workspace / "sparse" / "0")
-        images = [*model.images, model.images[3]]
-        write_model(replace(model, images=images), tmp_path / "model", binary=binary)
-        name = model.images[3].name
-        with pytest.raises(
-            SourceError, match=rf"images\.(bin|txt), frame {name}, field name: the image is listed twice"
-        ):
-            read_model(tmp_path / "model")
-
-    def test_a_model_without_images_is_refused(self, workspace, tmp_path, binary) -> None:
-        model = read_model(workspace / "sparse" / "0")
-        write_model(replace(model, images=[]), tmp_path / "model", binary=binary)
-        with pytest.raises(SourceError, match=r"images\.(bin|txt): the model holds no registered image"):
-            read_model(tmp_path / "model")
-
-    def test_names_of_images_are_read_from_either_kind_of_file(self, workspace, tmp_path, binary) -> None:
-        model = read_model(workspace / "sparse" / "0")
-        write_model(model, tmp_path / "model", binary=binary)
-        assert read_image_names(tmp_path / "model") == [image.name for image in model.images]
 
 
 class TestPoints:
