@@ -335,12 +335,11 @@ def _text_cameras(file: Path) -> dict[int, Lens]:
 
 
 def _text_images(file: Path) -> Iterator[_ImageRow]:
-    lines = list(_lines(file))
-    # Two lines an image; the second may be empty, so empty lines count.
-    while lines and not lines[-1][1].strip():
-        lines.pop()
-    for start in range(0, len(lines), 2):
-        number, line = lines[start]
+    lines = _lines(file)
+    for number, line in lines:
+        # Two lines an image, of which the second may be empty. COLMAP passes over those before the first.
+        if not line.strip():
+            continue
         words = line.split(maxsplit=9)
         try:
             values = [float(word) for word in words[1:8]]
@@ -351,12 +350,12 @@ def _text_images(file: Path) -> Iterator[_ImageRow]:
                 "each image has two lines, the second may be empty",
                 file=file,
             ) from error
-        rest = lines[start + 1][1] if start + 1 < len(lines) else ""
+        second, rest = next(lines, (number + 1, ""))
         try:
             numbers = np.array(rest.split(), dtype=np.float64).reshape(-1, 3)
         except ValueError as error:
             raise SourceError(
-                f"line {number + 1}: expected X Y POINT3D_ID for each keypoint", file=file, frame=name
+                f"line {second}: expected X Y POINT3D_ID for each keypoint", file=file, frame=name
             ) from error
         yield (
             name,

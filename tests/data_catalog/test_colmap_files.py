@@ -127,6 +127,25 @@ class TestText:
         np.testing.assert_array_equal(found.points_rgb, [[0, 128, 255], [255, 0, 1]])
         assert found.images[0].observed_point.tolist() == [1, 0]
 
+    def test_empty_lines_between_images_are_passed_over(self, tmp_path: Path) -> None:
+        """Of two lines of an image the second may be empty, and is no separator then."""
+        model = model_of_three()
+        write_model(model, tmp_path, binary=False)
+        file = tmp_path / "images.txt"
+        lines = [one for one in file.read_text().splitlines() if not one.startswith("#")]
+        heads = [one for one in lines if one.strip()]
+        assert len(heads) == 3
+        for text in (
+            "\n".join(f"{head}\n" for head in heads),
+            "# of another program\n\n" + "\n\n\n".join(heads) + "\n\n\n",
+            "\n \n\n" + "\n1 2 -1 3 4 -1\n\n".join(heads),
+        ):
+            file.write_text(text)
+            found = read_model(tmp_path)
+            assert [image.name for image in found.images] == [image.name for image in model.images]
+            for image, expected in zip(found.images, model.images, strict=True):
+                np.testing.assert_allclose(image.world_from_camera, expected.world_from_camera, atol=1e-9)
+
     @pytest.mark.parametrize(
         "line",
         [
