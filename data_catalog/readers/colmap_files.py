@@ -350,7 +350,7 @@ def _text_images(file: Path) -> Iterator[_ImageRow]:
                 "each image has two lines, the second may be empty",
                 file=file,
             ) from error
-        second, rest = next(lines, (number + 1, ""))
+        second, rest = next(lines, (number, ""))
         try:
             numbers = np.array(rest.split(), dtype=np.float64).reshape(-1, 3)
         except ValueError as error:
