@@ -23,7 +23,7 @@ __all__ = ["branch", "explore", "merge", "next_anchors", "start"]
 NEXT_ANCHORS = "next_anchors"
 
 
-@stage("explore-start", version=7)
+@stage("explore-start", version=8)
 def start(slot: Slot, scene: Ref, sequence: Ref, freespace: Ref, config: ExploreConfig) -> None:
     """Measure the scene and choose the anchors; writes `search/` and `state/`."""
     from extrags.exploration import prepare_search, start_exploration
@@ -44,7 +44,7 @@ def start(slot: Slot, scene: Ref, sequence: Ref, freespace: Ref, config: Explore
     slot.counts.update(renders=context.measured.renders)
 
 
-@stage("explore-branch", version=4)
+@stage("explore-branch", version=5)
 def branch(
     slot: Slot, scene: Ref, freespace: Ref, search: Ref, state: Ref, anchor: int, config: ExploreConfig
 ) -> None:
@@ -66,7 +66,7 @@ def merge(slot: Slot, state: Ref, branches: list[Ref]) -> None:
     _write_state(slot, before.merged([slot.load(Branch, ref) for ref in branches]))
 
 
-@stage("explore", version=3)
+@stage("explore", version=4)
 def explore(
     slot: Slot,
     scene: Ref,

@@ -26,9 +26,7 @@ class LightConfig(StageConfig):
         True, description="learn strength and roughness of the highlights of a wet surface"
     )
     exposure: bool = Field(True, description="learn a gain per training frame")
-    offset: bool = Field(
-        False, description="learn where the lamp stands beside the lens; did not pay where it was measured"
-    )
+    offset: bool = Field(True, description="learn where the lamp stands beside the lens")
     exponent: float = Field(
         0.6,
         gt=0,
@@ -39,6 +37,15 @@ class LightConfig(StageConfig):
         0.005,
         gt=0,
         description="of strength and roughness of the highlights; faster, they take their shape from a few",
+    )
+    offset_learning_rate: float = Field(
+        0.001, gt=0, description="of the lamp's place beside the lens, in median training depths"
+    )
+    offset_prior: float = Field(
+        0.002,
+        ge=0,
+        description="weight of the lamp's distance from the lens, in median training depths: without, "
+        "tissue that is darker on one side moves the lamp",
     )
     exposure_learning_rate: float = Field(0.005, gt=0, description="of the exposure per frame")
     exposure_prior: float = Field(

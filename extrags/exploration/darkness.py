@@ -52,8 +52,9 @@ def lit_luminance(
         import torch
 
         with torch.no_grad():
-            cosine = torch.from_numpy(1 / np.linalg.norm(rays, axis=-1))
-            falloff = light.falloff(torch.from_numpy(distance), cosine).numpy()
+            points = rays * np.where(valid, depth_mm, 1.0)[..., None]
+            turned = camera.world_from_camera[0, :3, :3]
+            falloff = light.gain(torch.from_numpy(points @ turned)).numpy()
             brightness = light.invert_response(torch.from_numpy(brightness).clamp(max=1.0)).numpy()
     else:
         falloff = np.ones_like(distance)

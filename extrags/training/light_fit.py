@@ -8,12 +8,21 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Float
+from torch import Tensor
 
 from extrags.config import LightConfig
 from extrags.illumination import NearFieldLight
 from extrags.raster.light import ROUGHNESS_MIN, ROW_LENGTH
 
-__all__ = ["LOG_ROUGHNESS_BOUNDS", "DenseAdam", "LightFit", "learned_parameters", "learning_rate"]
+__all__ = [
+    "BESIDE",
+    "LOG_ROUGHNESS_BOUNDS",
+    "DenseAdam",
+    "LightFit",
+    "lamp_distance",
+    "learned_parameters",
+    "learning_rate",
+]
 
 COMMON = (
     "log_softening",
@@ -26,6 +35,11 @@ COMMON = (
     "log_roughness",
 )
 """Parameters all cameras share, in the order of `CameraLight.packed`; the exposure comes before them."""
+BESIDE = (1.0, 1.0, 0.0)
+"""Which axes the lamp moves along: it stands beside the lens. Free along the optical axis as well, it leaves
+the scope's tip by a tenth of the depth, since a fall-off that is off looks much the same."""
+SMALLEST_OFFSET = 3e-3
+"""Distances of the lamp from the lens, in reference distances, that are rounded off to zero."""
 LOG_ROUGHNESS_BOUNDS = (math.log(ROUGHNESS_MIN) + 1e-3, -1e-3)
 """A learned roughness is kept inside those of the lobe: at them it has no gradient that brings it back."""
 
@@ -47,8 +61,22 @@ def learned_parameters(config: LightConfig) -> list[str]:
 
 def learning_rate(name: str, config: LightConfig) -> float:
     """Of one of the parameters that all cameras share."""
+    if name == "offset":
+        return config.offset_learning_rate
     specular = name in ("log_specular", "log_roughness")
     return config.specular_learning_rate if specular else config.learning_rate
+
+
+def lamp_distance(offset: Float[Tensor, "3"]) -> Float[Tensor, ""]:
+    """How far beside the lens the lamp stands, by which the loss holds it there; smooth at zero.
+
+    Not its square, which would draw lamps that do stand beside the lens away from their place as well.
+
+    Args:
+        offset: of the light, in reference distances.
+    """
+    softened = offset.square().sum() + SMALLEST_OFFSET**2
+    return softened.sqrt() - SMALLEST_OFFSET
 
 
 class DenseAdam:
@@ -120,6 +148,9 @@ class LightFit:
             self._logarithms[slots.begin : slots.end] = slots.logarithm
             self._free[slots.begin : slots.end] = name in learned
             rates[slots.begin : slots.end] = learning_rate(name, config)
+        offset = self._slots["offset"]
+        self._offset = slice(offset.begin, offset.end)
+        self._free[self._offset] *= BESIDE
         self._any_free = bool(self._free.any())
         self._row = np.zeros(ROW_LENGTH, dtype=np.float32)
         self._row[-1] = light.reference_distance
@@ -160,17 +191,20 @@ class LightFit:
         return float(np.add.reduce(values, dtype=np.float64)) / len(values)
 
     def prior(self) -> float:
-        """The term of the loss that holds log-exposures near zero; it applies to real frames only."""
+        """Terms of the loss that hold the lamp at the lens, and log-exposures of real frames near zero."""
+        term = 0.0
+        if self._config.offset:
+            term = self._config.offset_prior * float(lamp_distance(self._tensor[self._offset]))
         if self._frame is None:
-            return 0.0
+            return term
         exposures = self._log_exposure
-        return self._config.exposure_prior * float(exposures @ exposures) / len(exposures)
+        return term + self._config.exposure_prior * float(exposures @ exposures) / len(exposures)
 
     def step(self, gradient: Float[np.ndarray, "14"], rate_share: float = 1.0) -> None:
         """Step what is learned.
 
         Args:
-            gradient: of the loss without the prior, with respect to the last `row`.
+            gradient: of the loss without the priors, with respect to the last `row`.
             rate_share: of the settings' learning rates.
         """
         if self._any_free:
@@ -182,8 +216,12 @@ class LightFit:
             self._exposure_adam.step(self.exposure_gradient(gradient), rate_share)
 
     def common_gradient(self, gradient: Float[np.ndarray, "14"]) -> Float[np.ndarray, "10"]:
-        """Gradient of the parameters all cameras share, in the order of a row; zero where not learned."""
+        """Gradient of the parameters all cameras share, with that of the prior; zero where not learned."""
         common: np.ndarray = gradient[3:-1] * self._free
+        if self._config.offset and self._config.offset_prior > 0:
+            offset = self._common[self._offset]
+            softened = math.sqrt(float(offset @ offset) + SMALLEST_OFFSET**2)
+            common[self._offset] += self._config.offset_prior / softened * offset * BESIDE
         np.multiply(common, self._row[3:-1], out=common, where=self._logarithms)
         return common
 

@@ -11,6 +11,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from extrags.gaussians import Gaussians
@@ -20,7 +21,14 @@ from extrags.raster.direct import DirectStep, Target
 from extrags.raster.loss import depth_loss
 from extrags.scene import Scene
 from extrags.training.density import DensityStrategy
-from extrags.training.light_fit import LOG_ROUGHNESS_BOUNDS, LightFit, learned_parameters, learning_rate
+from extrags.training.light_fit import (
+    BESIDE,
+    LOG_ROUGHNESS_BOUNDS,
+    LightFit,
+    lamp_distance,
+    learned_parameters,
+    learning_rate,
+)
 from extrags.training.schedule import Schedule
 from extrags.training.views import View
 
@@ -141,6 +149,8 @@ class AutogradStep:
         loss = loss * view.loss_weight
         if scene.light is not None and view.frame is not None:
             loss = loss + schedule.light.exposure_prior * scene.light.log_exposure.square().mean()
+        if scene.light is not None and schedule.light.offset:
+            loss = loss + schedule.light.offset_prior * lamp_distance(scene.light.offset)
         for penalty in _penalties(schedule, self.adam.parameters, density, iteration):
             loss = loss + penalty
         loss.backward()
@@ -292,6 +302,8 @@ def _trainable_light(
     learned = learned_parameters(config)
     for name in learned:
         values[name].requires_grad_()
+    if "offset" in learned:
+        values["offset"].register_hook(_beside_the_lens)
     if config.exposure:
         values["log_exposure"].requires_grad_()
     trainable = NearFieldLight(**values, reference_distance=light.reference_distance)
@@ -300,3 +312,7 @@ def _trainable_light(
         {"params": [values["log_exposure"]], "initial_lr": config.exposure_learning_rate},
     ]
     return trainable, torch.optim.Adam(groups, eps=1e-15)
+
+
+def _beside_the_lens(gradient: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
+    return gradient * gradient.new_tensor(BESIDE)

@@ -37,19 +37,26 @@ class LightTransfer:
     exponent: float
     scale_mm: float
 
+    @cached_property
+    def lamp_position(self) -> Float[Tensor, "3"] | None:
+        """Of the lamp beside the lens, in camera axes and world units; None where it is at the lens."""
+        if self.light is None or not bool(self.light.offset.any()):
+            return None
+        return self.light.offset.detach().cpu() * self.light.reference_distance
+
     def falloff(
         self,
         distance: Float[Tensor, "*b"],
         axis_cosine: Float[Tensor, "*b"],
         facing_cosine: Float[Tensor, "*b"] | None = None,
     ) -> Float[Tensor, "*b"]:
-        """Brightness relative to that of a surface at the reference distance, on the axis, facing the lens.
+        """Brightness relative to that of a surface at the reference distance, on the axis, facing the lamp.
 
         Args:
-            distance: from the lens, in world units.
-            axis_cosine: cosine between the ray and the optical axis; counts with `light` only.
-            facing_cosine: cosine between the ray and the surface's normal; counts with `light` only. None
-                takes every surface to face the lens.
+            distance: from the lamp, in world units.
+            axis_cosine: cosine between its ray and the optical axis; counts with `light` only.
+            facing_cosine: cosine between its ray and the surface's normal; counts with `light` only. None
+                takes every surface to face the lamp.
         """
         if self.light is not None:
             return self.light.falloff(distance, axis_cosine, facing_cosine)

@@ -99,6 +99,7 @@ class _Surface:
         direction: from it, unit.
         axis_cosine: to the optical axis.
         normal: unit.
+        rotation: from the world's axes to the camera's.
     """
 
     center: Float[np.ndarray, "3"]
@@ -107,6 +108,7 @@ class _Surface:
     direction: Float[Tensor, "p 3"]
     axis_cosine: Float[Tensor, "p"]
     normal: Float[Tensor, "p 3"]
+    rotation: Float[Tensor, "3 3"]
 
 
 def warp_references(
@@ -220,15 +222,41 @@ def _relit(
 ) -> Float[Tensor, "k 3 p"]:
     """Colours of other views, as bright as this one shows them."""
     transfer = references.transfer
-    facing = (here.normal * here.direction).sum(dim=-1)
-    ratio = transfer.falloff(here.distance, here.axis_cosine, facing)[None] / transfer.falloff(
-        seen.distance, seen.axis_cosine, seen.facing_cosine
-    )
-    ratio = ratio * (gain / references.exposure[chosen])[:, None]
+    lamp = transfer.lamp_position
+    if lamp is None:
+        facing = (here.normal * here.direction).sum(dim=-1)
+        own = transfer.falloff(here.distance, here.axis_cosine, facing)[None]
+        theirs = transfer.falloff(seen.distance, seen.axis_cosine, seen.facing_cosine)
+    else:
+        centers = references.cameras.centers[chosen.numpy()] - here.center
+        shifts = torch.from_numpy(centers.astype(np.float32))
+        own = transfer.falloff(*_from_lamp(here, here.rotation[None], torch.zeros(1, 3), lamp))
+        theirs = transfer.falloff(*_from_lamp(here, references.viewmats[chosen, :3, :3], shifts, lamp))
+    ratio = own / theirs * (gain / references.exposure[chosen])[:, None]
     ratio = ratio.clamp(1 / BRIGHTNESS_LIMIT, BRIGHTNESS_LIMIT)
     rgb = transfer.apply_response(transfer.invert_response(seen.rgb) * ratio[:, None])
     # Too bright for the sensor: darkened as a whole, so that the hue stays.
     return rgb / rgb.amax(dim=1, keepdim=True).clamp_min(1)
+
+
+def _from_lamp(
+    surface: _Surface,
+    rotation: Float[Tensor, "k 3 3"],
+    centers: Float[Tensor, "k 3"],
+    lamp: Float[Tensor, "3"],
+) -> tuple[Float[Tensor, "k p"], Float[Tensor, "k p"], Float[Tensor, "k p"]]:
+    """Distance of a surface from the lamps of K cameras, and cosines of the light to axis and normal.
+
+    Args:
+        surface: points and normals.
+        rotation: from the world's axes to the cameras'.
+        centers: of their lenses, relative to that of the surface's own view.
+        lamp: beside the lens, in camera axes and world units.
+    """
+    away = surface.points - (centers + lamp @ rotation)[:, None]
+    distance = away.norm(dim=-1).clamp_min(1e-9)
+    axis_cosine = torch.einsum("kpi,ki->kp", away, rotation[:, 2]) / distance
+    return distance, axis_cosine, (away * surface.normal).sum(dim=-1) / distance
 
 
 def seen_by_others(
@@ -277,7 +305,9 @@ def _surface(camera: Cameras, depth_mm: Float[Tensor, "1 h w"], stride: int) -> 
     distance = offsets.norm(dim=-1).clamp_min(1e-9)
     cosine = 1 / rays.norm(dim=-1).reshape(-1)
     normal = depth_normals(_camera_rays(camera), depth_mm)[offset::stride, offset::stride].reshape(-1, 3)
-    return _Surface(camera.centers[0], offsets, distance, offsets / distance[:, None], cosine, normal)
+    rotation = torch.from_numpy(camera.viewmats[0, :3, :3].astype(np.float32))
+    direction = offsets / distance[:, None]
+    return _Surface(camera.centers[0], offsets, distance, direction, cosine, normal, rotation)
 
 
 def depth_normals(rays: Float[Tensor, "h w 3"], depth_mm: Float[Tensor, "1 h w"]) -> Float[Tensor, "h w 3"]:

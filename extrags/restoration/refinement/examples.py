@@ -23,7 +23,7 @@ from extrags.view_synthesis.gamut import Gamut
 
 __all__ = ["EXAMPLES_VERSION", "ExampleCrops", "RefinementExamples", "RefinerBatch"]
 
-EXAMPLES_VERSION = 3
+EXAMPLES_VERSION = 4
 """Raised by hand whenever the same scene and restorer give other examples."""
 PLACEMENTS = 2
 """Ways to lay the tiles that each view is shown with."""

@@ -309,26 +309,20 @@ def _crude_gaussians(views: ReferenceViews, generator: np.random.Generator) -> G
     view = chosen // (views.cameras.width * views.cameras.height)
     depth = 1 / packed[chosen, 4]
     offsets = rays[chosen] * depth[:, None]
-    distance = np.linalg.norm(offsets, axis=1)
     # Flat on the surface, as a scene's Gaussians are: the light darkens what is turned away from it.
     normals = surface_normals(views.cameras.centers[view] + offsets)
-    facing = (normals * offsets).sum(axis=1) / distance
-    seen = tuple(
-        torch.from_numpy(values.astype(np.float32)) for values in (distance, depth / distance, facing)
-    )
-    falloff = views.transfer.falloff(*seen).numpy()
-    signal = views.transfer.invert_response(torch.from_numpy(packed[chosen, :3])).numpy()
-    signal = signal / views.exposure.numpy()[view, None]
-    if views.transfer.light is not None:
+    colors = packed[chosen, :3]
+    light = views.transfer.light
+    # Without a light the fall-off cannot be divided out: the colour stays as it was seen.
+    if light is not None:
         turned = views.cameras.world_from_camera[view, :3, :3]
-        in_camera = (
+        in_camera = [
             torch.from_numpy(np.einsum("nji,nj->ni", turned, values).astype(np.float32))
             for values in (offsets, normals)
-        )
-        signal = (signal - views.transfer.light.specular_gain(*in_camera).detach().numpy()[:, None]).clip(0)
-    albedo = signal / np.maximum(falloff, MIN_GAIN)[:, None]
-    # Without a light the fall-off cannot be divided out: the colour stays as it was seen.
-    colors = albedo if views.transfer.light is not None else packed[chosen, :3]
+        ]
+        signal = light.invert_response(torch.from_numpy(colors)).numpy() / views.exposure.numpy()[view, None]
+        signal = (signal - light.specular_gain(*in_camera).detach().numpy()[:, None]).clip(0)
+        colors = signal / np.maximum(light.gain(*in_camera).detach().numpy(), MIN_GAIN)[:, None]
     # Standard deviation of a Gaussian that covers the area of one point.
     pitch = np.sqrt(len(usable) / count) / views.cameras.K[view, 0, 0]
     radius = 0.6 * depth * pitch * np.exp(generator.normal(0, 0.25, count))

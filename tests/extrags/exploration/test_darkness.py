@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -115,6 +117,17 @@ class TestDarkDirection:
         depth = np.linspace(10, 90, WIDTH)[None].repeat(HEIGHT, axis=0)
         image = 0.4 * light.falloff(torch.from_numpy(depth * DISTANCE_PER_DEPTH)).numpy()
         lit = lit_luminance(CAMERA, grey(image).astype(np.float64), depth, depth > 0, light)
+        np.testing.assert_allclose(lit, 0.4, rtol=1e-5)
+
+    def test_a_lamp_beside_the_lens_makes_no_side_dark(self) -> None:
+        light = replace(NearFieldLight.initial(1, 30.0, PLAIN), offset=torch.tensor([0.2, -0.1, 0.0]))
+        pose = look_at(np.array([3.0, 1.0, 2.0]), np.array([9.0, -4.0, 20.0]), np.array([0.3, -1.0, 0.0]))
+        camera = Cameras(CAMERA.K, pose[None], WIDTH, HEIGHT)
+        depth = np.linspace(10, 90, WIDTH)[None].repeat(HEIGHT, axis=0)
+        points = pixel_rays(CAMERA)[0] * depth[..., None]
+        from_lamp = np.linalg.norm(points - [6.0, -3.0, 0.0], axis=-1)
+        image = 0.4 * light.falloff(torch.from_numpy(from_lamp)).numpy()
+        lit = lit_luminance(camera, grey(image).astype(np.float64), depth, depth > 0, light)
         np.testing.assert_allclose(lit, 0.4, rtol=1e-5)
 
     def test_spread_and_response_of_a_light_are_undone_too(self) -> None:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +9,7 @@ import torch
 
 from extrags.config import LightConfig
 from extrags.illumination import NearFieldLight
-from extrags.training.light_fit import COMMON, LOG_ROUGHNESS_BOUNDS, DenseAdam, LightFit
+from extrags.training.light_fit import COMMON, LOG_ROUGHNESS_BOUNDS, DenseAdam, LightFit, lamp_distance
 
 EVERYTHING = LightConfig(offset=True)
 
@@ -39,10 +40,13 @@ def test_gradients_are_those_of_autograd() -> None:
     fit.row(3)
     row = light.camera_light(light.exposure(3)[None]).packed()[0]
     prior = EVERYTHING.exposure_prior * light.log_exposure.square().mean()
+    prior = prior + EVERYTHING.offset_prior * lamp_distance(light.offset)
     (row @ torch.from_numpy(gradient) + prior).backward()
     assert fit.prior() == pytest.approx(float(prior.detach()), rel=1e-6)
     found = [values[name].grad for name in COMMON]
     expected = torch.cat([value.reshape(-1) for value in found if value is not None]).numpy()
+    # The lamp does not leave the plane of the lens.
+    expected[COMMON.index("offset") + 2] = 0
     np.testing.assert_allclose(fit.common_gradient(gradient), expected, rtol=1e-5)
     exposure = values["log_exposure"].grad
     assert exposure is not None
@@ -50,7 +54,7 @@ def test_gradients_are_those_of_autograd() -> None:
 
 
 def test_what_is_not_learned_stays() -> None:
-    config = LightConfig(falloff=False, response=False, specular=False, exposure=False)
+    config = LightConfig(falloff=False, response=False, specular=False, exposure=False, offset=False)
     light = NearFieldLight.initial(4, 10.0, config)
     fit = LightFit(light, config)
     for _ in range(3):
@@ -62,10 +66,36 @@ def test_what_is_not_learned_stays() -> None:
         assert torch.equal(after[name], value) != moved, name
 
 
+def test_the_lamp_moves_beside_the_lens_at_a_rate_of_its_own() -> None:
+    config = LightConfig(offset_learning_rate=0.002)
+    fit = LightFit(NearFieldLight.initial(2, 10.0, config), config)
+    fit.row(0)
+    fit.step(np.where(np.arange(14) == 8, -1, 1).astype(np.float32))
+    np.testing.assert_allclose(fit.light.offset, [-0.002, 0.002, 0], rtol=1e-5)
+    assert float(lamp_distance(fit.light.offset)) == pytest.approx(
+        math.hypot(0.002, 0.002, 0.003) - 0.003, rel=1e-3
+    )
+    assert float(fit.light.spread) == pytest.approx(0.5 - config.learning_rate)
+
+
+def test_a_lamp_that_nothing_holds_beside_the_lens_comes_back() -> None:
+    fit = LightFit(_light(), EVERYTHING)
+    start = fit.light.offset[:2].clone()
+    for _ in range(300):
+        fit.row(0)
+        fit.step(np.zeros(14, dtype=np.float32))
+    assert float(start.norm()) > 0.05
+    assert float(fit.light.offset[:2].norm()) < 0.005
+    free = LightFit(_light(), LightConfig(offset_prior=0))
+    free.row(0)
+    free.step(np.zeros(14, dtype=np.float32))
+    assert torch.equal(free.light.offset[:2], start)
+
+
 def test_a_virtual_view_teaches_no_exposure() -> None:
     fit = LightFit(_light(), EVERYTHING)
     fit.row(None)
-    assert fit.prior() == 0
+    assert fit.prior() == pytest.approx(EVERYTHING.offset_prior * float(lamp_distance(fit.light.offset)))
     before = fit.light.detached()
     fit.step(_gradient())
     assert torch.equal(fit.light.log_exposure, before.log_exposure)

@@ -5,9 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from extrags.cameras import Cameras, pixel_rays, pose_distances
+from extrags.illumination import NearFieldLight
 from extrags.view_synthesis.references import LightTransfer, ReferenceViews
 from extrags.view_synthesis.warp import (
     covisibility,
@@ -156,6 +158,59 @@ def test_the_angle_to_the_wall_is_compensated() -> None:
         sure = (warped.blend_weight > 0.5).expand(-1, 3, -1, -1)
         errors.append(float((warped.blend - truth).abs()[sure].mean()))
     assert errors[0] < 0.6 * errors[1]
+
+
+def _with_lamp_beside(
+    cameras: Cameras, light: NearFieldLight, lamp: NearFieldLight
+) -> tuple[Float[Tensor, "v 3 h w"], Float[Tensor, "v 1 h w"]]:
+    """Images and depth of the tube, whose `light` at the lens is replaced by one beside it."""
+    rgb, depth = cast_tube(cameras, light)
+    in_camera = Cameras(cameras.K, np.tile(np.eye(4), (len(cameras), 1, 1)), cameras.width, cameras.height)
+    points = torch.from_numpy((pixel_rays(in_camera) * depth[..., None]).astype(np.float32))
+    signal = light.invert_response(torch.from_numpy(rgb.astype(np.float32)))
+    # Darker, so that what is near the lamp does not exceed one.
+    signal = 0.7 * signal * (lamp.gain(points) / light.gain(points))[..., None]
+    return light.apply_response(signal).permute(0, 3, 1, 2), torch.from_numpy(depth.astype(np.float32))[
+        :, None
+    ]
+
+
+@pytest.mark.parametrize("origin_mm", [0.0, 1e5])
+def test_a_lamp_beside_the_lens_is_compensated(origin_mm: float) -> None:
+    light = replace(tube_light(8), log_shoulder=torch.tensor(-torch.inf))
+    lamp = replace(light, offset=torch.tensor([0.15, -0.1, 0.0]))
+    recorded = tube_cameras(8)
+    cameras = tube_cameras(3, offset_mm=4.0, start_mm=6.0, turn=0.6)
+    shown, _ = _with_lamp_beside(recorded, light, lamp)
+    target, depth = _with_lamp_beside(cameras, light, lamp)
+    references = exact_references(recorded, light)
+    packed = references.packed.clone()
+    packed[:, :3] = shown
+    transfer = replace(references.transfer, light=lamp)
+    away = np.array([origin_mm, -origin_mm, 0.0])
+    references = replace(references, packed=packed, cameras=_moved(recorded, away), transfer=transfer)
+    told = warp_references(references, _moved(cameras, away), depth, count=4)
+    blind = references.with_transfer(replace(transfer, light=light))
+    unaware = warp_references(blind, _moved(cameras, away), depth, count=4)
+    assert _error(told, target) < 5e-3
+    assert _error(unaware, target) > 3 * _error(told, target)
+
+
+def test_a_light_at_the_lens_has_no_place_beside_it() -> None:
+    light = tube_light(2)
+    beside = replace(light, offset=torch.tensor([0.1, 0.0, -0.05]))
+    assert LightTransfer(None, 0.5, 20.0).lamp_position is None
+    assert LightTransfer(light, 0.5, 20.0).lamp_position is None
+    position = LightTransfer(beside, 0.5, 20.0).lamp_position
+    assert position is not None
+    expected = light.reference_distance * np.array([0.1, 0.0, -0.05])
+    np.testing.assert_allclose(position.numpy(), expected, rtol=1e-6)
+
+
+def _moved(cameras: Cameras, by: Float[np.ndarray, "3"]) -> Cameras:
+    poses = cameras.world_from_camera.copy()
+    poses[:, :3, 3] += by
+    return replace(cameras, world_from_camera=poses)
 
 
 def _rays(width: int, height: int) -> Tensor:
