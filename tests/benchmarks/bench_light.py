@@ -44,7 +44,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "no cosine": {"light": {"cosine": False}},
     "no response": {"light": {"response": False}},
     "no highlights": {"light": {"specular": False}},
-    "with offset": {"light": {"offset": True}},
+    "lamp in the lens": {"light": {"offset": False}},
     "fall-off only": {"light": {"spread": False, "cosine": False, "response": False, "specular": False}},
     "no light": {"light": {"enabled": False}},
     "round start": {"thickness": 1.0},
