@@ -47,16 +47,16 @@ def lit_luminance(
     """
     brightness = np.clip(luminance(rgb), 0.0, None)
     rays = pixel_rays(camera)[0]
-    distance = np.where(valid, depth_mm, 1.0) * np.linalg.norm(rays, axis=-1)
+    points = rays * np.where(valid, depth_mm, 1.0)[..., None]
     if light is not None:
         import torch
 
         with torch.no_grad():
-            points = rays * np.where(valid, depth_mm, 1.0)[..., None]
             turned = camera.world_from_camera[0, :3, :3]
             falloff = light.gain(torch.from_numpy(points @ turned)).numpy()
             brightness = light.invert_response(torch.from_numpy(brightness).clamp(max=1.0)).numpy()
     else:
+        distance = np.linalg.norm(points, axis=-1)
         falloff = np.ones_like(distance)
         usable = valid & (brightness > 1e-3) & (distance > 0)
         if usable.sum() >= 16:

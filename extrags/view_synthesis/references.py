@@ -38,10 +38,10 @@ class LightTransfer:
     scale_mm: float
 
     @cached_property
-    def lamp_position(self) -> Float[Tensor, "3"] | None:
-        """Of the lamp beside the lens, in camera axes and world units; None where it is at the lens."""
-        if self.light is None or not bool(self.light.offset.any()):
-            return None
+    def lamp_position(self) -> Float[Tensor, "3"]:
+        """Of the lamp beside the lens, in camera axes and world units; at the lens without `light`."""
+        if self.light is None:
+            return torch.zeros(3)
         return self.light.offset.detach().cpu() * self.light.reference_distance
 
     def falloff(

@@ -83,8 +83,6 @@ class _Seen:
     weight: Float[Tensor, "k p"]
     quality: Float[Tensor, "k p"]
     distance: Float[Tensor, "k p"]
-    axis_cosine: Float[Tensor, "k p"]
-    facing_cosine: Float[Tensor, "k p"]
 
 
 @dataclass(frozen=True)
@@ -97,7 +95,6 @@ class _Surface:
         points: [P, 3].
         distance: from the lens.
         direction: from it, unit.
-        axis_cosine: to the optical axis.
         normal: unit.
         rotation: from the world's axes to the camera's.
     """
@@ -106,7 +103,6 @@ class _Surface:
     points: Float[Tensor, "p 3"]
     distance: Float[Tensor, "p"]
     direction: Float[Tensor, "p 3"]
-    axis_cosine: Float[Tensor, "p"]
     normal: Float[Tensor, "p 3"]
     rotation: Float[Tensor, "3 3"]
 
@@ -222,16 +218,12 @@ def _relit(
 ) -> Float[Tensor, "k 3 p"]:
     """Colours of other views, as bright as this one shows them."""
     transfer = references.transfer
-    lamp = transfer.lamp_position
-    if lamp is None:
-        facing = (here.normal * here.direction).sum(dim=-1)
-        own = transfer.falloff(here.distance, here.axis_cosine, facing)[None]
-        theirs = transfer.falloff(seen.distance, seen.axis_cosine, seen.facing_cosine)
-    else:
-        centers = references.cameras.centers[chosen.numpy()] - here.center
-        shifts = torch.from_numpy(centers.astype(np.float32))
-        own = transfer.falloff(*_from_lamp(here, here.rotation[None], torch.zeros(1, 3), lamp))
-        theirs = transfer.falloff(*_from_lamp(here, references.viewmats[chosen, :3, :3], shifts, lamp))
+    centers = references.cameras.centers[chosen.numpy()] - here.center
+    shifts = torch.from_numpy(centers.astype(np.float32))
+    own = transfer.falloff(*_from_lamp(here, here.rotation[None], torch.zeros(1, 3), transfer.lamp_position))
+    theirs = transfer.falloff(
+        *_from_lamp(here, references.viewmats[chosen, :3, :3], shifts, transfer.lamp_position)
+    )
     ratio = own / theirs * (gain / references.exposure[chosen])[:, None]
     ratio = ratio.clamp(1 / BRIGHTNESS_LIMIT, BRIGHTNESS_LIMIT)
     rgb = transfer.apply_response(transfer.invert_response(seen.rgb) * ratio[:, None])
@@ -303,11 +295,10 @@ def _surface(camera: Cameras, depth_mm: Float[Tensor, "1 h w"], stride: int) -> 
     rays = torch.from_numpy(pixel_rays(camera)[0, offset::stride, offset::stride].astype(np.float32))
     offsets = (rays * depth_mm[0, offset::stride, offset::stride, None]).reshape(-1, 3)
     distance = offsets.norm(dim=-1).clamp_min(1e-9)
-    cosine = 1 / rays.norm(dim=-1).reshape(-1)
     normal = depth_normals(_camera_rays(camera), depth_mm)[offset::stride, offset::stride].reshape(-1, 3)
     rotation = torch.from_numpy(camera.viewmats[0, :3, :3].astype(np.float32))
     direction = offsets / distance[:, None]
-    return _Surface(camera.centers[0], offsets, distance, direction, cosine, normal, rotation)
+    return _Surface(camera.centers[0], offsets, distance, direction, normal, rotation)
 
 
 def depth_normals(rays: Float[Tensor, "h w 3"], depth_mm: Float[Tensor, "1 h w"]) -> Float[Tensor, "h w 3"]:
@@ -393,8 +384,7 @@ def _look_up(
         -(seen_from / surface.distance).log().abs() / DISTANCE_TOLERANCE
         - (torch.arccos(cosine) / ANGLE_TOLERANCE_RAD).square()
     )
-    facing = (away / seen_from[..., None] * surface.normal).sum(dim=-1)
-    return _Seen(sampled[:, :3], weight, quality, seen_from, z / seen_from, facing)
+    return _Seen(sampled[:, :3], weight, quality, seen_from)
 
 
 def fit_falloff_exponent(references: ReferenceViews, *, pairs: int = 24) -> float:

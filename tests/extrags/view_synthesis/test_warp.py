@@ -196,15 +196,11 @@ def test_a_lamp_beside_the_lens_is_compensated(origin_mm: float) -> None:
     assert _error(unaware, target) > 3 * _error(told, target)
 
 
-def test_a_light_at_the_lens_has_no_place_beside_it() -> None:
-    light = tube_light(2)
-    beside = replace(light, offset=torch.tensor([0.1, 0.0, -0.05]))
-    assert LightTransfer(None, 0.5, 20.0).lamp_position is None
-    assert LightTransfer(light, 0.5, 20.0).lamp_position is None
-    position = LightTransfer(beside, 0.5, 20.0).lamp_position
-    assert position is not None
+def test_the_place_of_a_lamp_is_in_world_units() -> None:
+    light = replace(tube_light(2), offset=torch.tensor([0.1, 0.0, -0.05]))
     expected = light.reference_distance * np.array([0.1, 0.0, -0.05])
-    np.testing.assert_allclose(position.numpy(), expected, rtol=1e-6)
+    np.testing.assert_allclose(LightTransfer(light, 0.5, 20.0).lamp_position, expected, rtol=1e-6)
+    assert not bool(LightTransfer(None, 0.5, 20.0).lamp_position.any())
 
 
 def _moved(cameras: Cameras, by: Float[np.ndarray, "3"]) -> Cameras:
