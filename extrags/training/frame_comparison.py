@@ -99,7 +99,8 @@ class ComparedFrames:
         brightness = small.rgb[frames].astype(np.float32) / 255 @ _GREY
         self.usable = small.supervised_mask(frames) & ~saturated_mask(small.rgb[frames])
         self.usable &= (self.depth > 0) & (brightness > DARK)
-        self.grey = np.log(brightness + OFFSET)
+        # The border of a round picture is no edge of what it shows, and not blurred with it.
+        self.grey = _continued(np.log(brightness + OFFSET), small.mask[frames])
         cameras = small.cameras[frames]
         self._K = cameras.K
         self._world_from_camera = cameras.world_from_camera
@@ -208,6 +209,21 @@ class ComparedFrames:
     @staticmethod
     def _at(image: np.ndarray, nearest: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
         return image if image.shape == (1, 1) else image[nearest]
+
+
+def _continued(
+    images: Float[np.ndarray, "m h w"], masks: Bool[np.ndarray, "m h w"]
+) -> Float[np.ndarray, "m h w"]:
+    """Images whose pixels outside of their masks have the value of the nearest pixel inside."""
+    # On first use: most sequences have no border.
+    from scipy.ndimage import distance_transform_edt
+
+    continued = images.copy()
+    for image, mask in zip(continued, masks, strict=True):
+        if mask.any() and not mask.all():
+            nearest = distance_transform_edt(~mask, return_distances=False, return_indices=True)
+            image[...] = image[tuple(nearest)]
+    return continued
 
 
 def _detail(image: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:

@@ -85,6 +85,16 @@ class TestClearFrames:
         found = judged(replace(plane, rgb=(means + contrast * (texture - means)).astype(np.uint8)))
         assert found.weights.tolist() == [1.0] * FRAMES
 
+    def test_the_black_border_of_a_round_picture_is_no_edge(self, plane: EndoscopicSequence) -> None:
+        rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+        disc = np.hypot(columns + 0.5 - WIDTH / 2, rows + 0.5 - HEIGHT / 2) < 0.48 * HEIGHT
+        mask = np.broadcast_to(disc, plane.mask.shape).copy()
+        shown = judged(replace(plane, mask=mask))
+        black = judged(replace(plane, mask=mask, rgb=plane.rgb * disc[..., None]))
+        assert black.weights.tolist() == [1.0] * FRAMES
+        assert black.statements == []
+        np.testing.assert_allclose(black.sharpness, shown.sharpness, atol=0.03)
+
 
 class TestBlur:
     @pytest.mark.parametrize("length_px", [5, 9])
