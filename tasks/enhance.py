@@ -119,7 +119,7 @@ def _only(config: EnhanceConfig, names: frozenset[str]) -> EnhanceConfig:
 
 
 # The model's digest is in the key: with another model in the same place, this is another restorer.
-@stage("enhance-train", version=31, ignore=("given",))
+@stage("enhance-train", version=32, ignore=("given",))
 def train(
     slot: Slot,
     scene: Ref,

@@ -49,7 +49,10 @@ class LightConfig(StageConfig):
     )
     exposure_learning_rate: float = Field(0.005, gt=0, description="of the exposure per frame")
     exposure_prior: float = Field(
-        1.0, ge=0, description="weight that holds log-exposures near their mean of zero"
+        0.1,
+        ge=0,
+        description="weight that holds log-exposures near their mean of zero; at 1 hardly any automatic "
+        "exposure is learned",
     )
 
 

@@ -66,7 +66,7 @@ def bake_recorded_light(
     The gain of each Gaussian, and what highlights add, are means over the views, weighted by the largest
     blending weight it has in each. Seen from where the recording was made it looks like the recording; where
     a viewer's camera comes nearer than that, or turns, the brightness does not follow. Gaussians that no view
-    shows take the gain of the nearest camera, as if they faced it.
+    shows take the gain that the nearest camera would give them if it looked straight at them.
 
     Args:
         scene: with or without light.

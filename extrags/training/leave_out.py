@@ -117,6 +117,7 @@ def partial_scene(
         sh_degree=brief.sh_degree,
         seed=brief.seed,
         thickness=brief.thickness,
+        exposures=None if light is None else light.exposures().cpu().numpy(),
     )
     views = [view.to(scene.device) for view in weighted_views(sequence, kept, brief, frame_weights)[0]]
     order = epochs(len(views), np.random.default_rng(brief.seed))

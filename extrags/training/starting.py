@@ -109,6 +109,7 @@ def starting_gaussians(
     thickness: float = 1.0,
     seed: int = 0,
     where: Bool[np.ndarray, "m h w"] | None = None,
+    exposures: Float[np.ndarray, "m"] | None = None,
 ) -> Gaussians:
     """Gaussians from back-projected depth, from sparse points without depth, or at random without either.
 
@@ -130,6 +131,7 @@ def starting_gaussians(
         thickness: along the surface's normal, as a share of the radius; 1 makes round Gaussians.
         seed: chooses among equivalent pixels, and random points.
         where: pixels of the frames that may start Gaussians; None: all valid ones.
+        exposures: gain of each of the frames, where it is known already; counts with `light`. None: all 1.
 
     Raises:
         CaptureError: when neither depth nor points are known and all cameras stand in one place; when no
@@ -152,6 +154,8 @@ def starting_gaussians(
     if light is not None:
         local = np.einsum("nji,nj->ni", cameras.world_from_camera[view, :3, :3], z[:, None] * rays)
         rgb = light.albedo(torch.from_numpy(rgb), torch.from_numpy(local)).detach().numpy()
+        if exposures is not None:
+            rgb = rgb / exposures[view, None]
     points, rgb = thin_out(points, rgb, max_points)
     floor = 1e-3 * float(np.median(z))
     return Gaussians.from_points(

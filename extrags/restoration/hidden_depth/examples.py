@@ -28,7 +28,7 @@ from extrags.view_synthesis.gather import gather_references
 
 __all__ = ["EXAMPLES_VERSION", "HiddenDepthExamples"]
 
-EXAMPLES_VERSION = 7
+EXAMPLES_VERSION = 8
 """Raised by hand whenever the same recording and restorer give other examples."""
 EVERY_VIEW = 2
 """Of a trajectory, one of so many views is taken."""

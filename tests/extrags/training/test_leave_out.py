@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
-from extrags.config import CoarseConfig
+from extrags.config import CoarseConfig, LightConfig
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
 from extrags.training import leave_out, reconstruct
@@ -95,3 +97,31 @@ def test_normals_count_where_they_did(
         leave_out.partial_scene(scene, blurred, config, np.arange(4), iterations=1, seed=0, stage="test")
     assert terms[0] is None
     assert terms[1] is not None
+
+
+def test_they_start_from_pictures_of_one_exposure(
+    blurred: EndoscopicSequence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = CoarseConfig(iterations=1, max_points=200, light=LightConfig(response=False))
+    scene = reconstruct(blurred, config).scene
+    assert scene.light is not None
+    gains = np.exp(np.where(np.arange(len(blurred.train)) % 2 == 0, -0.3, 0.3))
+    rgb = blurred.rgb.copy()
+    for frame, gain in zip(blurred.train, gains, strict=True):
+        rgb[frame] = (0.5 * gain * blurred.rgb[frame]).round()
+    starts = []
+
+    def looked_at(start: Scene, draw: Any, schedule: Any, **_more: Any) -> TrainingResult:
+        starts.append(start.gaussians.sh0)
+        return TrainingResult(start, [])
+
+    monkeypatch.setattr(leave_out, "optimise", looked_at)
+    even = (0.5 * blurred.rgb).round().astype(np.uint8)
+    for pictures, exposures in ((even, np.ones_like(gains)), (rgb, gains)):
+        light = replace(scene.light, log_exposure=torch.from_numpy(np.log(exposures)).float())
+        leave_out.partial_scene(
+            replace(scene, light=light), replace(blurred, rgb=pictures), config, blurred.train,
+            iterations=1, seed=0, stage="test",
+        )  # fmt: skip
+    # Half a step of 8 bits, brightened by the darker half of these gains, in harmonics of degree 0.
+    assert float((starts[0] - starts[1]).abs().max()) < 0.5 / 255 / (0.5 * np.exp(-0.3)) / 0.2821

@@ -84,6 +84,20 @@ class TestReconstruct:
         # Against the undimmed frames: few views leave exposure and albedo some play either way.
         assert first_to_third(dimmed) / first_to_third(tube_sequence) == pytest.approx(0.8, abs=0.08)
 
+    def test_an_automatic_exposure_is_learned(self, tube_sequence: EndoscopicSequence) -> None:
+        """By the default settings, in the iterations of a brief profile, most of it."""
+        rgb = tube_sequence.rgb.astype(np.float32)
+        rgb[tube_sequence.train[0]] *= 0.7
+        dimmed = replace(tube_sequence, rgb=rgb.round().astype(np.uint8))
+        config = CoarseConfig(iterations=300, max_points=600)
+
+        def first_to_third(sequence: EndoscopicSequence) -> float:
+            light = reconstruct(sequence, config).scene.light
+            assert light is not None
+            return float(light.exposure(0) / light.exposure(2))
+
+        assert 0.65 < first_to_third(dimmed) / first_to_third(tube_sequence) < 0.85
+
     def test_progress_is_told(self, tube_sequence: EndoscopicSequence) -> None:
         seen: list[Event] = []
         with subscribed(seen.append):
