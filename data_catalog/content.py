@@ -12,7 +12,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-__all__ = ["Circle", "content_circle", "content_mask", "looked_at", "overlay_mask", "view_mask"]
+__all__ = [
+    "Circle",
+    "FramedPicture",
+    "content_circle",
+    "content_mask",
+    "framed_picture",
+    "looked_at",
+    "overlay_mask",
+    "view_mask",
+]
 
 logger = logging.getLogger(__name__)
 
@@ -44,6 +53,15 @@ _MOVED_SHARE = 0.25
 """So much of the picture must change visibly before what stays can be called burnt in."""
 _VISIBLE_CHANGE = 8.0
 _LARGEST_OVERLAY = 0.15
+_ALIKE_MIRRORED = 0.9
+"""Intersection over union of a picture's outline and its mirror image: pictures are symmetric, and what light
+or an instrument leaves of them is not."""
+_RIM_SHARE = 0.02
+"""Of the image width: how far on both sides of a picture's outline it is looked whether it is a rim."""
+_RIM_DARK = 0.9
+"""So much of what is just outside of a rim is dark; the rest may be text."""
+_RIM_LIT = 0.75
+"""So much of what is just inside of a rim is lit, at least in some frames. Light that fades has no rim."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +85,28 @@ class Circle:
         x = np.arange(width)[None, :] + 0.5 - self.center_x
         y = np.arange(height)[:, None] + 0.5 - self.center_y
         return np.asarray(np.hypot(x, y) <= self.radius_px - margin_px)
+
+
+@dataclass(frozen=True)
+class FramedPicture:
+    """The box round a picture with a dark surround, in pixels with edges at whole numbers.
+
+    Args:
+        left: first column.
+        top: first row.
+        width: number of columns.
+        height: number of rows.
+    """
+
+    left: int
+    top: int
+    width: int
+    height: int
+
+    @property
+    def center(self) -> tuple[float, float]:
+        """Column and row of its middle, pixel centres at +0.5."""
+        return self.left + self.width / 2, self.top + self.height / 2
 
 
 def view_mask(rgb: UInt8[np.ndarray, "f h w 3"], dark_below: int = _DARK) -> Bool[np.ndarray, "h w"]:
@@ -130,6 +170,41 @@ def content_circle(rgb: UInt8[np.ndarray, "f h w 3"]) -> Circle | None:
     if share < _CIRCLE_INLIERS or (region & disc).sum() < _CIRCLE_LIT * disc.sum():
         return None
     return replace(circle, inliers=share)
+
+
+def framed_picture(
+    mask: Bool[np.ndarray, "f h w"], rgb: UInt8[np.ndarray, "f h w 3"]
+) -> FramedPicture | None:
+    """The picture inside a dark frame, of whatever outline and wherever in the frame.
+
+    A mask alone does not tell: it also leaves out text, instruments, dark corners and unlit lumen, or is what
+    somebody has drawn. The surround counts as clear where the largest region that the mask keeps is convex
+    and symmetric, and its outline is a rim: dark on one side and lit on the other.
+
+    Args:
+        mask: where frames show tissue.
+        rgb: the frames.
+
+    Returns:
+        None where the picture fills the image, or its surround is not clear.
+    """
+    import cv2
+
+    region = _largest(np.asarray(np.any(mask, axis=0)))
+    if not region.any():
+        return None
+    outline, _ = cv2.findContours(region.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    whole, hull = np.zeros(region.shape, np.uint8), np.zeros(region.shape, np.uint8)
+    cv2.drawContours(whole, outline, -1, 1, cv2.FILLED)
+    cv2.fillConvexPoly(hull, cv2.convexHull(np.concatenate(outline)), 1)
+    left, top, width, height = cv2.boundingRect(hull)
+    if (height, width) == region.shape or hull.sum() > (1 + _LARGEST_DENT) * whole.sum():
+        return None
+    inside = hull[top : top + height, left : left + width] > 0
+    for mirrored in (inside[:, ::-1], inside[::-1]):
+        if (inside & mirrored).sum() < _ALIKE_MIRRORED * (inside | mirrored).sum():
+            return None
+    return FramedPicture(left, top, width, height) if _is_rim(hull, rgb) else None
 
 
 def overlay_mask(
@@ -235,6 +310,35 @@ def _dark_below(rgb: UInt8[np.ndarray, "f h w 3"]) -> int:
         return _DARK
     middle = rgb[:, height // 4 : -(height // 4), width // 4 : -(width // 4)].max(axis=-1)
     return dark_below if np.median(middle) > 2 * dark_below else _DARK
+
+
+def _is_rim(picture: UInt8[np.ndarray, "h w"], rgb: UInt8[np.ndarray, "f h w 3"]) -> bool:
+    """Whether an outline, as far as it lies inside the image, parts what is lit from what is always dark."""
+    import cv2
+
+    brightest = np.zeros(picture.shape, np.uint8)
+    for index in looked_at(len(rgb)):
+        np.maximum(brightest, rgb[index].max(axis=-1), out=brightest)
+    # The mask may end a margin inside of the rim, which is blurred.
+    gap = 1 + int(np.ceil(2 * _MARGIN_SHARE * picture.shape[1]))
+    thickness = max(2, round(_RIM_SHARE * picture.shape[1]))
+
+    def grown(by: int) -> UInt8[np.ndarray, "h w"]:
+        # The image border is no rim.
+        kernel = np.ones((2 * abs(by) + 1, 2 * abs(by) + 1), np.uint8)
+        padded = np.pad(picture, abs(by), mode="edge")
+        changed = cv2.dilate(padded, kernel) if by > 0 else cv2.erode(padded, kernel)
+        return np.asarray(changed[abs(by) : -abs(by), abs(by) : -abs(by)])
+
+    beyond = brightest[(grown(gap + thickness) > 0) & (grown(gap) == 0)]
+    within = brightest[(picture > 0) & (grown(-thickness) == 0)]
+    limit = _LARGEST_DARK + _ABOVE_SURROUND
+    return bool(
+        len(beyond) > 0
+        and len(within) > 0
+        and (beyond < limit).mean() >= _RIM_DARK
+        and (within >= limit).mean() >= _RIM_LIT
+    )
 
 
 def _picture(seen: Bool[np.ndarray, "h w"], margin_px: float) -> Bool[np.ndarray, "h w"]:

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from data_catalog.checks import depth_disagreement
+from data_catalog.content import framed_picture
 from data_catalog.findings import Finding, warning
 from data_catalog.mask_findings import mask_findings
 from data_catalog.matches import match_neighbours, pose_support
@@ -211,8 +212,9 @@ def _intrinsics(sequence: EndoscopicSequence) -> Iterator[Finding]:
     if sequence.intrinsics == "guessed":
         # Of a video's pixels that are told to be wider than high, for instance: not K's own claim.
         return
+    picture = framed_picture(sequence.mask, sequence.rgb)
     for index in range(len(sequence)):
-        problem = unlikely(sequence.K[index], sequence.width, sequence.height)
+        problem = unlikely(sequence.K[index], sequence.width, sequence.height, picture)
         if problem is not None:
             yield warning("intrinsics", problem, frame=sequence.frame_name(index), field="K")
             return

@@ -1,11 +1,11 @@
-"""Intrinsics of images that nothing states: a usual field of view, through the round picture's centre."""
+"""Intrinsics of images that nothing states: a usual field of view, through the centre of the picture."""
 
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 
-from data_catalog.content import content_circle
+from data_catalog.content import content_circle, framed_picture
 
 __all__ = ["ASSUMED_FIELD_OF_VIEW_DEG", "fitted_to_picture", "intrinsics_of_field_of_view"]
 
@@ -13,7 +13,8 @@ ASSUMED_FIELD_OF_VIEW_DEG = 90.0
 """Near the middle of what endoscopes have: 70 (laparoscopes) to 170 degrees (capsules, duodenoscopes)."""
 
 _MAX_OFFSET_SHARE = 0.2
-"""A round picture whose centre is farther from the image's middle, in widths, is no lens's rim."""
+"""A round picture whose centre is farther from the image's middle, in widths, is no lens's rim, unless a
+clear dark surround says so."""
 
 
 def intrinsics_of_field_of_view(
@@ -32,17 +33,19 @@ def intrinsics_of_field_of_view(
 
 
 def fitted_to_picture(
-    K: Float[np.ndarray, "f 3 3"], mask: Bool[np.ndarray, "f h w"]
+    K: Float[np.ndarray, "f 3 3"], mask: Bool[np.ndarray, "f h w"], rgb: UInt8[np.ndarray, "f h w 3"]
 ) -> Float[np.ndarray, "f 3 3"]:
-    """A guess of intrinsics that respects the round picture inside the frame, where there is one.
+    """A guess of intrinsics that respects the picture inside the frame, where it does not fill it.
 
-    The stop that cuts the picture out sits on the optical axis: the circle's centre is the better guess of
-    the principal point. Where the circle is narrower than the image, the assumed field of view is the
-    circle's.
+    The stop that cuts a round picture out sits on the optical axis: the circle's centre is the better guess
+    of the principal point. Where the circle is narrower than the image, the assumed field of view is the
+    circle's. Of a picture of another outline, or far from the image's middle as beside a recorder's panel,
+    centre and width are those of its box, where its dark surround is clear.
 
     Args:
         K: guessed from the image's size, in pixels.
         mask: where frames show tissue.
+        rgb: the frames.
     """
     import cv2
 
@@ -53,14 +56,22 @@ def fitted_to_picture(
     if height != rows:
         seen = cv2.resize(seen, (width, height), interpolation=cv2.INTER_NEAREST)
     circle = content_circle(np.repeat(seen[None, :, :, None] * 255, 3, axis=3))
-    if circle is None:
-        return K
-    offset = max(abs(circle.center_x - width / 2), abs(circle.center_y - height / 2))
-    if offset > _MAX_OFFSET_SHARE * width:
-        return K
+    if circle is not None:
+        offset = max(abs(circle.center_x - width / 2), abs(circle.center_y - height / 2))
+        if offset <= _MAX_OFFSET_SHARE * width:
+            center = circle.center_x, circle.center_y * rows / height
+            return _fitted(K, center, 2 * circle.radius_px / width)
+    picture = framed_picture(mask, rgb)
+    return K if picture is None else _fitted(K, picture.center, picture.width / width)
+
+
+def _fitted(
+    K: Float[np.ndarray, "f 3 3"], center: tuple[float, float], width_share: float
+) -> Float[np.ndarray, "f 3 3"]:
+    """K through another centre, whose field of view is that of a part of the image's width."""
     fitted = K.copy()
-    fitted[:, 0, 2], fitted[:, 1, 2] = circle.center_x, circle.center_y * rows / height
-    narrower = min(1.0, 2 * circle.radius_px / width)
+    fitted[:, :2, 2] = center
+    narrower = min(1.0, width_share)
     fitted[:, 0, 0] *= narrower
     fitted[:, 1, 1] *= narrower
     return fitted

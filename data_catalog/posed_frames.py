@@ -194,7 +194,7 @@ def assembled(source: SourceFrames, config: IngestConfig, name: str) -> Endoscop
     K = np.stack([pixels.samplings[frame.lens].K for frame in kept])
     rgb, mask = pixels.colors.array, pixels.masks(kept)
     if source.intrinsics == "guessed":
-        K = fitted_to_picture(K, mask)
+        K = fitted_to_picture(K, mask, rgb)
     lens = pixels.lens(kept, source.pose_file)
     if world_from_camera is not None:
         world_from_camera = _rolled(world_from_camera, [pixels.samplings[f.lens].roll_rad for f in kept])

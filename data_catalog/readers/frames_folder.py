@@ -330,7 +330,7 @@ def _order(folder: Path) -> dict[str, Any]:
 
 READER = FolderReader(
     name="frames",
-    version=10,
+    version=11,
     summary="plain images in the folder, in images/ or in rgb/, optionally with intrinsics.json and mask.png",
     recognises=_recognises,
     files=_files,

@@ -134,7 +134,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
 
 READER = FolderReader(
     name="tum",
-    version=2,
+    version=3,
     summary=f"{_COLOUR} with {_POSES} or {_DEPTH} of TUM's RGB-D layout, described in "
     "data_catalog/readers/tum.py",
     recognises=_recognises,

@@ -341,7 +341,7 @@ def _footage(place: Path, config: IngestConfig) -> Footage:
 
 READER = FolderReader(
     name="video",
-    version=9,
+    version=10,
     summary="a video file (mp4, avi, mov, mkv, ...), optionally with intrinsics.json and mask.png beside it",
     recognises=_recognises,
     files=_files,

@@ -211,6 +211,30 @@ def test_intrinsics_of_the_picture_on_its_side_are_told(clip) -> None:
     assert told in found[0].sentence
 
 
+def test_intrinsics_are_those_of_the_picture_where_it_has_a_clear_surround(clip) -> None:
+    # Beside a panel, as recorders put it.
+    beside = ((0, 0), (10, 10), (120, 14))
+    K = clip.K.copy()
+    K[:, 0, 2] += 120
+    recorded = replace(
+        clip,
+        rgb=np.pad(clip.rgb, (*beside, (0, 0))),
+        mask=np.pad(clip.mask, beside),
+        K=K,
+        depth_mm=None,
+        observed=None,
+        specular=None,
+    )
+    assert "intrinsics" not in {finding.topic for finding in diagnose(recorded, "here")}
+    in_the_middle = K.copy()
+    in_the_middle[:, 0, 2] = recorded.width / 2
+    found = [
+        item for item in diagnose(replace(recorded, K=in_the_middle), "here") if item.topic == "intrinsics"
+    ]
+    assert len(found) == 1
+    assert f"far from the centre of {clip.width} x {clip.height} pixels" in found[0].sentence
+
+
 def test_metres_that_are_called_millimetres_are_told(clip) -> None:
     """Depth and poses in one unit contradict nothing, and the report said millimetres."""
     poses = clip.world_from_camera.copy()
