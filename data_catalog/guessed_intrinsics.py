@@ -43,7 +43,7 @@ def fitted_to_picture(
     centre and width are those of its box, where its dark surround is clear.
 
     Args:
-        K: guessed from the image's size, in pixels.
+        K: of a field of view over the image's width, in pixels.
         mask: where frames show tissue.
         rgb: the frames.
     """

@@ -135,6 +135,8 @@ class SourceFrames:
         truth: what else is known, for `EndoscopicSequence.truth`.
         intrinsics: whether the lenses are stated by the source, or guessed because nothing states them; then
             all frames have one.
+        angle_alone: whether the lenses are made of a stated field of view and nothing else: it belongs to the
+            picture inside the frame, as a guessed one does.
         looked_at: steps of progress that were reported before the first frame is read.
         lens_stays: why no calibration file may take the place of the lenses that are stated, as a sentence;
             None where one may.
@@ -162,6 +164,7 @@ class SourceFrames:
     points_rgb: UInt8[np.ndarray, "p 3"] | None = None
     truth: Callable[[EndoscopicSequence], dict[str, Any]] | None = None
     intrinsics: Literal["given", "guessed"] = "given"
+    angle_alone: bool = False
     looked_at: int = 0
     lens_stays: str | None = None
     stereo_camera: StereoCamera | None = None
@@ -193,7 +196,7 @@ def assembled(source: SourceFrames, config: IngestConfig, name: str) -> Endoscop
     tell_about_pages(kept[0].file)
     K = np.stack([pixels.samplings[frame.lens].K for frame in kept])
     rgb, mask = pixels.colors.array, pixels.masks(kept)
-    if source.intrinsics == "guessed":
+    if source.intrinsics == "guessed" or source.angle_alone:
         K = fitted_to_picture(K, mask, rgb)
     lens = pixels.lens(kept, source.pose_file)
     if world_from_camera is not None:

@@ -21,7 +21,12 @@ from data_catalog.footage import Footage, FootageFrame, TimeSpan
 from data_catalog.images import spread
 from data_catalog.interlacing import deinterlaced
 from data_catalog.posed_frames import PosedFrame, SourceFrames
-from data_catalog.readers.frames_folder import mask_beside, read_intrinsics, stated_intrinsics
+from data_catalog.readers.frames_folder import (
+    mask_beside,
+    read_intrinsics,
+    stated_intrinsics,
+    states_angle_alone,
+)
 from data_catalog.readers.stereo_footage import OneCamera, of_one_camera, time_span
 from data_catalog.sampling import Sampling
 from data_catalog.survey import NOTHING_DECODED, Shot, Survey, choose_frames, survey
@@ -117,6 +122,7 @@ def _unread(
         pose_file=file,
         metric=False,
         intrinsics=stated_intrinsics(file.parent, config),
+        angle_alone=states_angle_alone(file.parent, config),
         stereo_camera=config.stereo_camera if isinstance(footage, OneCamera) else None,
     )
 

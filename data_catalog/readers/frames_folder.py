@@ -11,9 +11,10 @@ What is depth or a mask of a frame by its name is left out, and what tells of po
 warning (`data_catalog.readers.beside_frames`).
 
 Optional in the folder: `intrinsics.json` with `K` (3 x 3), or `fx`, `fy`, `cx`, `cy`, or `field_of_view_deg`
-(horizontal), in pixels of the upright images with centres at +0.5, of a pinhole, and the size of the images
-(`width` and `height`, or the names that calibration files have for it), which is checked; and `mask.png`
-(white is tissue), of upright images too.
+(horizontal, over the width of the picture where that is narrower than the image), in pixels of the upright
+images with centres at +0.5, of a pinhole, and the size of the images (`width` and `height`, or the names that
+calibration files have for it), which is checked; and
+`mask.png` (white is tissue), of upright images too.
 Without intrinsics a horizontal field of view of 90 degrees is assumed, and said so in the log: the sequence's
 intrinsics are `guessed`, and the poses stage estimates them, lens distortion included. A calibration file
 (`ingest.calibration`) takes the place of both, and `intrinsics.json` is then not read. Without a mask, the
@@ -82,6 +83,7 @@ __all__ = [
     "places_with_frames",
     "read_intrinsics",
     "stated_intrinsics",
+    "states_angle_alone",
 ]
 
 logger = logging.getLogger(__name__)
@@ -92,6 +94,7 @@ FEWEST_FRAMES = 4
 """Fewer stills beside a video are pictures about it: poses could not be estimated from them."""
 _CLEARLY_MORE = 2
 _LOOKED_AT_FOR_COMBS = 12
+_ANGLE = "field_of_view_deg"
 _EXPECTED = "expected K, or fx, fy, cx, cy, or field_of_view_deg"
 
 
@@ -259,6 +262,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
         read_color=_Images(folder, [files[k] for k in spread(len(files), config.max_frames)], views).image,
         masks=_ContentMask(),
         intrinsics=stated_intrinsics(folder, config),
+        angle_alone=states_angle_alone(folder, config),
         stereo_camera=config.stereo_camera if read.pairs or views is not None else None,
         upright=True,
     )
@@ -346,6 +350,18 @@ def stated_intrinsics(folder: Path, config: IngestConfig) -> Literal["given", "g
     return "given" if is_read else "guessed"
 
 
+def states_angle_alone(folder: Path, config: IngestConfig) -> bool:
+    """Whether `intrinsics.json`, where it is read, tells a field of view and no more of the lens.
+
+    Raises:
+        SourceError: the file is damaged.
+    """
+    if stated_intrinsics(folder, config) == "guessed":
+        return False
+    content = _content(folder / INTRINSICS_FILE)
+    return _ANGLE in content and not any(key in content for key in ("K", *PINHOLE_KEYS))
+
+
 def read_intrinsics(
     folder: Path,
     width: int,
@@ -393,34 +409,54 @@ def read_intrinsics(
         return intrinsics_of_field_of_view(
             ASSUMED_FIELD_OF_VIEW_DEG, width, height, pixel_aspect=pixel_aspect
         )
+    content = _content(file)
     try:
-        content = json.loads(file.read_text(encoding="utf-8-sig"))
-        if not isinstance(content, dict):
-            raise TypeError(f"found {type(content).__name__}, not an object")
         check_described(content, width, height, file, are_turned=are_turned)
         if "K" in content:
             K = np.asarray(content["K"], dtype=np.float64)
-        elif "field_of_view_deg" in content:
-            angle = number_of(content, "field_of_view_deg", file)
-            if not 1 < angle < 179:
-                raise SourceError(
-                    f"{angle:g} degrees; expected 1 to 179 for a pinhole",
-                    file=file,
-                    field="field_of_view_deg",
-                )
-            K = intrinsics_of_field_of_view(angle, width, height, pixel_aspect=pixel_aspect)
+        elif _ANGLE in content:
+            K = _of_angle(content, width, height, pixel_aspect, file)
         else:
             _check_complete(content, file)
             fx, fy, cx, cy = (number_of(content, key, file) for key in PINHOLE_KEYS)
             K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+        if K.shape != (3, 3):
+            raise SourceError(f"found shape {K.shape}; expected 3 x 3 numbers", file=file, field="K")
+        check_intrinsics(K, width, height, file=file)
     except SourceError:
         raise
     except (OverflowError, RecursionError, TypeError, ValueError) as error:
         raise SourceError(f"{_EXPECTED}: {error}", file=file, field="K") from error
-    if K.shape != (3, 3):
-        raise SourceError(f"found shape {K.shape}; expected 3 x 3 numbers", file=file, field="K")
-    check_intrinsics(K, width, height, file=file)
     return K
+
+
+def _content(file: Path) -> dict[str, Any]:
+    """The entries of `intrinsics.json`.
+
+    Raises:
+        SourceError: it holds none.
+    """
+    try:
+        content = json.loads(file.read_text(encoding="utf-8-sig"))
+    except (RecursionError, ValueError) as error:
+        raise SourceError(f"{_EXPECTED}: {error}", file=file, field="K") from error
+    if not isinstance(content, dict):
+        raise SourceError(f"{_EXPECTED}: found {type(content).__name__}, not an object", file=file, field="K")
+    return content
+
+
+def _of_angle(
+    content: dict[str, Any], width: int, height: int, pixel_aspect: float, file: Path
+) -> Float[np.ndarray, "3 3"]:
+    """K of the field of view that is stated.
+
+    Raises:
+        SourceError: it is none of a pinhole.
+    """
+    angle = number_of(content, _ANGLE, file)
+    if not 1 < angle < 179:
+        raise SourceError(f"{angle:g} degrees; expected 1 to 179 for a pinhole", file=file, field=_ANGLE)
+    return intrinsics_of_field_of_view(angle, width, height, pixel_aspect=pixel_aspect)
 
 
 def _check_complete(content: dict[str, Any], file: Path) -> None:

@@ -45,6 +45,7 @@ from data_catalog.readers.frames_folder import (
     mask_beside,
     read_intrinsics,
     stated_intrinsics,
+    states_angle_alone,
 )
 from data_catalog.rotations import quaternion_rotation
 from extrags.cameras import compose
@@ -129,6 +130,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
         metric=True,
         read_depth=_depth_mm,
         intrinsics=stated_intrinsics(folder, config),
+        angle_alone=states_angle_alone(folder, config),
     )
 
 

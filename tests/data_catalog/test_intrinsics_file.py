@@ -97,6 +97,33 @@ class TestOtherEntries:
         np.testing.assert_array_equal(stated(frames=3), K)
 
 
+class TestAFieldOfView:
+    """Stated alone, it is that of the picture inside the frame, which endoscopes are sold with."""
+
+    @staticmethod
+    def written(folder, shown: np.ndarray) -> None:
+        texture = np.random.default_rng(0).integers(60, 255, (120, 208, 3)).astype(np.uint8)
+        for number in range(6):
+            image = np.where(shown[..., None], texture[:, number : number + 200], 0)
+            Image.fromarray(image.astype(np.uint8)).save(folder / f"{number}.png")
+
+    def test_it_belongs_to_the_round_picture(self, tmp_path) -> None:
+        u, v = np.meshgrid(np.arange(200) + 0.5, np.arange(120) + 0.5)
+        self.written(tmp_path, np.hypot(u - 110, v - 60) < 50)
+        (tmp_path / "intrinsics.json").write_text(json.dumps({"field_of_view_deg": 70}))
+        found = read(tmp_path)
+        assert found.intrinsics == "given"
+        np.testing.assert_allclose(found.K[0, :2, 2], [110, 60], atol=1.5)
+        assert found.K[0, 0, 0] == pytest.approx(50 / np.tan(np.radians(35)), abs=3)
+
+    def test_a_pinhole_beside_the_same_picture_stays(self, tmp_path) -> None:
+        u, v = np.meshgrid(np.arange(200) + 0.5, np.arange(120) + 0.5)
+        self.written(tmp_path, np.hypot(u - 110, v - 60) < 50)
+        stated = {"fx": 71, "fy": 71, "cx": 112, "cy": 58}
+        (tmp_path / "intrinsics.json").write_text(json.dumps(stated))
+        np.testing.assert_array_equal(read(tmp_path).K[0], [[71, 0, 112], [0, 71, 58], [0, 0, 1]])
+
+
 class TestBesideTheImages:
     @pytest.mark.parametrize("in_folder", [False, True])
     def test_it_is_not_read_there(self, tmp_path, caplog, in_folder) -> None:
