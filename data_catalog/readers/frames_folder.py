@@ -13,7 +13,7 @@ warning (`data_catalog.readers.beside_frames`).
 Optional in the folder: `intrinsics.json` with `K` (3 x 3), or `fx`, `fy`, `cx`, `cy`, or `field_of_view_deg`
 (horizontal, over the width of the picture where that is narrower than the image), in pixels of the upright
 images with centres at +0.5, of a pinhole, and the size of the images (`width` and `height`, or the names that
-calibration files have for it), which is checked; and
+calibration files have for it), which is checked; what is told in several ways has to agree within 1 %. And
 `mask.png` (white is tissue), of upright images too.
 Without intrinsics a horizontal field of view of 90 degrees is assumed, and said so in the log: the sequence's
 intrinsics are `guessed`, and the poses stage estimates them, lens distortion included. A calibration file
@@ -95,6 +95,8 @@ FEWEST_FRAMES = 4
 _CLEARLY_MORE = 2
 _LOOKED_AT_FOR_COMBS = 12
 _ANGLE = "field_of_view_deg"
+_AGREEING = 0.01
+"""So far apart, relatively, may be what an `intrinsics.json` tells twice: angles are rounded."""
 _EXPECTED = "expected K, or fx, fy, cx, cy, or field_of_view_deg"
 
 
@@ -414,7 +416,7 @@ def read_intrinsics(
         check_described(content, width, height, file, are_turned=are_turned)
         if "K" in content:
             K = np.asarray(content["K"], dtype=np.float64)
-        elif _ANGLE in content:
+        elif _ANGLE in content and not any(key in content for key in PINHOLE_KEYS):
             K = _of_angle(content, width, height, pixel_aspect, file)
         else:
             _check_complete(content, file)
@@ -423,6 +425,7 @@ def read_intrinsics(
         if K.shape != (3, 3):
             raise SourceError(f"found shape {K.shape}; expected 3 x 3 numbers", file=file, field="K")
         check_intrinsics(K, width, height, file=file)
+        _check_agreement(content, K, width, height, file)
     except SourceError:
         raise
     except (OverflowError, RecursionError, TypeError, ValueError) as error:
@@ -457,6 +460,44 @@ def _of_angle(
     if not 1 < angle < 179:
         raise SourceError(f"{angle:g} degrees; expected 1 to 179 for a pinhole", file=file, field=_ANGLE)
     return intrinsics_of_field_of_view(angle, width, height, pixel_aspect=pixel_aspect)
+
+
+def _check_agreement(
+    content: dict[str, Any], K: Float[np.ndarray, "3 3"], width: int, height: int, file: Path
+) -> None:
+    """Refuse a lens that is told in several ways which differ: none of them is known to be the right one.
+
+    Args:
+        content: of the file.
+        K: that would be taken.
+        width: of the images, in pixels.
+        height: of the images, in pixels.
+        file: named in messages.
+
+    Raises:
+        SourceError: names two entries that contradict each other.
+    """
+    taken = "K" if "K" in content else "fx"
+    told = dict(zip(PINHOLE_KEYS, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]), strict=True))
+    sizes = dict(zip(PINHOLE_KEYS, (K[0, 0], K[1, 1], width, height), strict=True))
+    for key in (key for key in PINHOLE_KEYS if key in content):
+        value = number_of(content, key, file)
+        if not abs(value - told[key]) <= _AGREEING * sizes[key]:
+            raise SourceError(
+                f"{value:g} px, and {told[key]:g} px by {taken}; expected one of the two, or the same twice",
+                file=file,
+                field=f"{key}, {taken}",
+            )
+    if _ANGLE in content:
+        focal_px = _of_angle(content, width, height, 1.0, file)[0, 0]
+        if not abs(focal_px - K[0, 0]) <= _AGREEING * K[0, 0]:
+            raise SourceError(
+                f"{number_of(content, _ANGLE, file):g} degrees over {width} pixels are a focal length of "
+                f"{focal_px:.4g} px, and {taken} makes it {K[0, 0]:.4g}; expected one of the two, or the "
+                "same twice",
+                file=file,
+                field=f"{_ANGLE}, {taken}",
+            )
 
 
 def _check_complete(content: dict[str, Any], file: Path) -> None:

@@ -16,6 +16,7 @@ from extrags.errors import SourceError
 
 WIDTH, HEIGHT = 48, 32
 K = [[40.0, 0, 24], [0, 40.0, 16], [0, 0, 1]]
+PINHOLE = {"fx": 40, "fy": 40, "cx": 24, "cy": 16}
 
 
 @pytest.fixture
@@ -122,6 +123,35 @@ class TestAFieldOfView:
         stated = {"fx": 71, "fy": 71, "cx": 112, "cy": 58}
         (tmp_path / "intrinsics.json").write_text(json.dumps(stated))
         np.testing.assert_array_equal(read(tmp_path).K[0], [[71, 0, 112], [0, 71, 58], [0, 0, 1]])
+
+
+class TestToldTwice:
+    @pytest.mark.parametrize(
+        ("further", "field", "told"),
+        [
+            ({"fx": 50}, "fx, K", "50 px, and 40 px by K"),
+            ({"cx": 30}, "cx, K", "30 px, and 24 px by K"),
+            ({"field_of_view_deg": 90}, "field_of_view_deg, K", "90 degrees over 48 pixels .* 24 px"),
+        ],
+    )
+    def test_a_contradiction_is_refused(self, stated, further, field, told) -> None:
+        with pytest.raises(SourceError, match=f"{told}.*expected one of the two") as caught:
+            stated(**further)
+        assert (caught.value.field, caught.value.file.endswith("intrinsics.json")) == (field, True)
+
+    def test_a_pinhole_and_another_angle(self, tmp_path) -> None:
+        (tmp_path / "intrinsics.json").write_text(json.dumps({**PINHOLE, "field_of_view_deg": 90}))
+        with pytest.raises(SourceError, match="fx makes it 40"):
+            read_intrinsics(tmp_path, WIDTH, HEIGHT)
+
+    def test_an_angle_and_half_a_pinhole(self, tmp_path) -> None:
+        (tmp_path / "intrinsics.json").write_text(json.dumps({"cx": 24, "cy": 16, "field_of_view_deg": 90}))
+        with pytest.raises(SourceError, match="no fx, fy; expected K, or fx"):
+            read_intrinsics(tmp_path, WIDTH, HEIGHT)
+
+    def test_the_same_is_let_pass(self, stated) -> None:
+        # 61.93 degrees.
+        np.testing.assert_array_equal(stated(**PINHOLE, field_of_view_deg=62), K)
 
 
 class TestBesideTheImages:
