@@ -11,7 +11,7 @@
 `poses.json`::
 
     {
-      "length_unit": "mm",                     or "arbitrary"
+      "length_unit": "mm",                     or "arbitrary"; "mm" where it is absent, which the log says
       "K": [[fx, 0, cx], [0, fy, cy], [0, 0, 1]],   for all frames, or "K" in each frame
       "frames": [
         {"file": "rgb/0000.png",
@@ -100,6 +100,10 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
         further = {name: described[name] for name in described if name not in (*_KEYS, *_KEYS_OF_FRAMES)}
         check_pinhole(further, _OTHER_LENSES, file=file, frame=frame)
     warn_of_unknown_keys(content, known=_KEYS, known_of_frames=_KEYS_OF_FRAMES, frame_name="file", file=file)
+    if "length_unit" not in content:
+        logger.warning(
+            "%s has no length_unit: lengths are taken for millimetres; state mm, or arbitrary", file
+        )
     names = [entry["file"] for entry in entries]
     depth_files, mask_files = _depth_files(folder, names), _mask_files(folder, names)
     return SourceFrames(

@@ -86,6 +86,14 @@ class TestRightSources:
         assert (found.kind, found.topic, found.field) == ("warning", "number of frames", "split")
         assert found.sentence.startswith("1 of 2 frames is to train on, and the others are held out")
 
+    def test_a_length_unit_that_is_not_stated_is_a_note(self, posed_folder, edit_poses) -> None:
+        said = "no length_unit: lengths are taken for millimetres"
+        assert not any(said in note for note in inspect(posed_folder).notes)
+        edit_poses(lambda content: content.pop("length_unit"))
+        found = inspect(posed_folder)
+        assert found.facts["length_unit"] == "mm"
+        assert sum(said in note for note in found.notes) == 1
+
     def test_assumptions_are_notes(self, shared_data) -> None:
         found = inspect(shared_data / "sinus_hopkins" / "images", IngestConfig(downscale=8, max_frames=6))
         assert any("assuming a horizontal field of view of 90 degrees" in note for note in found.notes)
