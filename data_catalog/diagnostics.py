@@ -43,6 +43,8 @@ _MIN_BASELINE_SHARE = 0.02
 _Check = Callable[[EndoscopicSequence], Iterator[Finding]]
 _NEAREST_MM = 0.5
 """Nothing nearer is seen sharply; what an endoscope sees is at 2 to 200 mm, which are 0.002 to 0.2 m."""
+_FARTHEST_MM = 1000.0
+"""Nothing farther is lit; 2 to 200 mm are 2000 to 200000 micrometres."""
 _JUMP = 8.0
 _CLIPPED_SHARE = 0.02
 _SATURATED_SHARE = 0.6
@@ -277,14 +279,24 @@ def _poses(sequence: EndoscopicSequence) -> Iterator[Finding]:
 
 
 def _unit(sequence: EndoscopicSequence) -> Iterator[Finding]:
-    """Lengths that are called millimetres and are metres, which nothing else contradicts."""
+    """Lengths that are called millimetres and are not, which nothing else contradicts."""
     distance = _scene_distance(sequence)
-    if sequence.metric and distance is not None and distance < _NEAREST_MM:
+    if not sequence.metric or distance is None:
+        return
+    if distance < _NEAREST_MM:
         yield warning(
             "unit",
             f"lengths are taken for millimetres, and what cameras see is {distance:.3g} mm away (median), "
             "nearer than endoscopes see: are they metres? Multiply depth and positions of cameras by 1000, "
             "or state an arbitrary unit and give its millimetres (--scale 1000)",
+            field="length_unit",
+        )
+    elif distance > _FARTHEST_MM:
+        yield warning(
+            "unit",
+            f"lengths are taken for millimetres, and what cameras see is {distance:.4g} mm away (median), "
+            "farther than endoscopes light: are they micrometres? Divide depth and positions of cameras by "
+            "1000, or state an arbitrary unit and give its millimetres (--scale 0.001 for micrometres)",
             field="length_unit",
         )
 

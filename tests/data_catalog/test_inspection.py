@@ -243,15 +243,19 @@ def test_intrinsics_are_those_of_the_picture_where_it_has_a_clear_surround(clip)
     assert f"far from the centre of {clip.width} x {clip.height} pixels" in found[0].sentence
 
 
-def test_metres_that_are_called_millimetres_are_told(clip) -> None:
+@pytest.mark.parametrize(
+    ("factor", "told"),
+    [(1e-3, "nearer than endoscopes see: are they metres?"), (1e3, "are they micrometres?")],
+)
+def test_another_unit_that_is_called_millimetres_is_told(clip, factor, told) -> None:
     """Depth and poses in one unit contradict nothing, and the report said millimetres."""
     poses = clip.world_from_camera.copy()
-    poses[:, :3, 3] /= 1000
-    metres = replace(clip, world_from_camera=poses, depth_mm=clip.depth_mm / 1000)
-    for sequence, told in ((clip, False), (metres, True), (replace(metres, metric=False), False)):
+    poses[:, :3, 3] *= factor
+    other = replace(clip, world_from_camera=poses, depth_mm=clip.depth_mm * np.float32(factor))
+    for sequence, is_told in ((clip, False), (other, True), (replace(other, metric=False), False)):
         found = [finding for finding in diagnose(sequence, "here") if finding.topic == "unit"]
-        assert len(found) == told
-        assert all("nearer than endoscopes see: are they metres?" in item.sentence for item in found)
+        assert len(found) == is_told
+        assert all(told in item.sentence for item in found)
 
 
 def test_memory_does_not_grow_with_the_frames(clip) -> None:
