@@ -8,8 +8,9 @@ How frames are chosen and what is masked: `data_catalog.readers.footage_frames`.
 Read are uncompressed and JPEG-compressed pixels (whatever pydicom decodes with Pillow), and the streams of
 MPEG-2, MPEG-4 and HEVC that video endoscopes store, which go to the reader of videos. Colours: RGB, YBR_FULL,
 YBR_FULL_422, YBR_RCT and YBR_ICT (both of JPEG 2000), MONOCHROME2; of more than 8 bits the highest 8.
-Timestamps: Frame Time Vector, Frame Time, Cine Rate or Recommended Display Frame Rate. Pixels that are not
-square stay as they are; the intrinsics say so.
+Timestamps: Frame Time Vector, Frame Time, Cine Rate or Recommended Display Frame Rate. Without any, and with
+a vector that has not one entry for each frame, a warning says what is assumed: 25 frames a second where
+nothing else tells. Pixels that are not square stay as they are; the intrinsics say so.
 
 Nothing of a file but its pixels, their format and their timing is looked at: names and dates of patients stay
 where they are. What is burnt into the picture is masked as in a video, not removed.
@@ -313,8 +314,15 @@ def _times_s(header: Any, count: int, file: Path) -> Float[np.ndarray, "f"]:
     Raises:
         SourceError: a duration or a rate that is none.
     """
-    vector_ms = header.get("FrameTimeVector")
-    if vector_ms is not None and np.size(vector_ms) == count:
+    vector_ms = header.get("FrameTimeVector") or None
+    if vector_ms is not None and np.size(vector_ms) != count:
+        logger.warning(
+            "%s: its FrameTimeVector has %d entries for %d frames, and is not read",
+            file.name,
+            np.size(vector_ms),
+            count,
+        )
+    elif vector_ms is not None:
         steps_ms = np.asarray(vector_ms, dtype=np.float64)
         wrong = np.flatnonzero(~((steps_ms >= 0) & np.isfinite(steps_ms)))
         if wrong.size:
@@ -332,7 +340,12 @@ def _times_s(header: Any, count: int, file: Path) -> Float[np.ndarray, "f"]:
             raise SourceError(f"{value:g} {unit}; expected a positive number", file=file, field=name)
         if value:
             return np.arange(count) * (value if name == "FrameTime" else 1000 / value) / 1000
-    logger.info("%s: no timing, taken for %g frames a second", file.name, _USUAL_FRAMES_PER_S)
+    logger.warning(
+        "%s tells no timing: assuming %g frames a second, by which ingest.start_s, ingest.end_s and the "
+        "lengths of shots go",
+        file.name,
+        _USUAL_FRAMES_PER_S,
+    )
     return np.arange(count) / _USUAL_FRAMES_PER_S
 
 

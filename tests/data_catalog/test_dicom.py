@@ -83,6 +83,29 @@ class TestPixels:
         late = open_dicom(file).frames(TimeSpan(last_s - 1e-3))
         assert [frame.number for frame in late] == [11]
 
+    @pytest.mark.parametrize(
+        ("elements", "last_s", "told"),
+        [
+            ({"FrameTime": 50}, 0.55, []),
+            ({}, 0.44, ["a.dcm tells no timing: assuming 25 frames a second"]),
+            (
+                {"FrameTimeVector": [0, 100, 100]},
+                0.44,
+                ["FrameTimeVector has 3 entries for 12 frames", "tells no timing: assuming 25"],
+            ),
+            (
+                {"FrameTimeVector": [0, 100, 100], "FrameTime": 50},
+                0.55,
+                ["FrameTimeVector has 3 entries for 12 frames"],
+            ),
+        ],
+    )
+    def test_timing_that_is_assumed_is_told(self, scene, tmp_path, caplog, elements, last_s, told) -> None:
+        footage = open_dicom(write_dicom(tmp_path / "a.dcm", scene, **elements))
+        assert [frame.time_s for frame in footage.frames(TimeSpan())][-1] == pytest.approx(last_s)
+        assert len(caplog.messages) == len(told)
+        assert all(part in said for part, said in zip(told, caplog.messages, strict=True))
+
     def test_pixel_aspect(self, scene, tmp_path) -> None:
         file = write_dicom(tmp_path / "a.dcm", scene, PixelAspectRatio=[11, 12])
         K = read(file, IngestConfig(max_frames=4)).K[0]
