@@ -6,6 +6,7 @@ below raised; callers add file and remedy.
 
 from __future__ import annotations
 
+import io
 import stat
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -25,6 +26,7 @@ __all__ = [
     "load_ply_vertices",
     "load_safetensors",
     "load_state_dict",
+    "save_npy",
     "save_safetensors",
 ]
 
@@ -115,6 +117,18 @@ def load_safetensors(file: Path) -> dict[str, Tensor]:
         raise
     except Exception as error:
         raise ValueError(f"no safetensors file, or damaged: {error}") from error
+
+
+def save_npy(file: Path, array: np.ndarray) -> None:
+    """Write an npy file.
+
+    Raises:
+        OSError: it cannot be written. numpy, given a file, says how many values it wrote and not that the
+            disk is full.
+    """
+    content = io.BytesIO()
+    np.save(content, array)
+    file.write_bytes(content.getbuffer())
 
 
 def save_safetensors(file: Path, tensors: dict[str, Tensor], metadata: dict[str, str] | None = None) -> None:

@@ -119,7 +119,12 @@ def mask_beside(folder: Path, images: Path | None = None) -> Path | None:
     check_links([found])
     for file in (file for place in {folder, images or folder} for file in image_entries(place)):
         if is_mask(file) and file != found:
-            logger.warning("%s is not read; the mask of all frames is %s", file, found)
+            logger.warning(
+                "%s is not read; the mask of all frames is %s",
+                file,
+                found,
+                extra={"topic": "not read", "field": "files"},
+            )
     return found if found.is_file() else None
 
 

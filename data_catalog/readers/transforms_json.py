@@ -67,6 +67,7 @@ from data_catalog.readers.transforms_files import (
 )
 from data_catalog.readers.transforms_lens import DISTORTION_KEYS, FOCAL_KEYS, StatedLens, stated_values
 from data_catalog.readers.unknown_keys import warn_of_unknown_keys
+from extrags.array_files import save_npy
 from extrags.config import IngestConfig
 from extrags.errors import PoseError, SourceError, SourceNotFoundError
 from extrags.frame_names import NameOrder, natural_key, order_for_fingerprint, tell_about_order
@@ -240,7 +241,7 @@ def write_transforms(
             place = folder / entry["depth_file_path"]
             place.parent.mkdir(parents=True, exist_ok=True)
             # In double precision, so that only the reader rounds.
-            np.save(place, sequence.depth_mm[index].astype(np.float64) / NERFSTUDIO_DEPTH_SCALE)
+            save_npy(place, sequence.depth_mm[index].astype(np.float64) / NERFSTUDIO_DEPTH_SCALE)
         frames.append({**entry, "transform_matrix": pose.tolist()})
     content: dict[str, Any] = {
         "camera_model": "PINHOLE" if sequence.lens is None else "OPENCV_FISHEYE",
@@ -313,6 +314,15 @@ def _pose(entry: dict[str, Any], scale: float, file: Path, frame: str) -> Float[
     if isinstance(rows, list) and len(rows) == 3:
         entry = {**entry, "transform_matrix": [*rows, [0, 0, 0, 1.0]]}
     matrix = matrix_of(entry, "transform_matrix", 4, file=file, frame=frame, error=PoseError)
+    # Turned to other axes, one entry becomes several, of another matrix.
+    wrong = int((~np.isfinite(matrix)).sum())
+    if wrong:
+        raise PoseError(
+            f"{wrong} of {matrix.size} entries are NaN or infinite",
+            file=file,
+            frame=frame,
+            field="transform_matrix",
+        )
     pose = matrix @ _OPENCV_FROM_OPENGL
     pose[:3, 3] *= scale
     return pose

@@ -11,6 +11,7 @@ from PIL import Image
 
 from data_catalog.catalog import read, source_fingerprint
 from data_catalog.content import view_mask
+from data_catalog.inspection import inspect
 from data_catalog.readers.sinus import read_points, read_view_names
 from extrags.config import IngestConfig
 from extrags.errors import PoseError, SourceError, SourceNotFoundError
@@ -173,11 +174,13 @@ class TestFrames:
         read(frames)
         assert "masks is not read; of plain frames, one mask.png holds for all" in caplog.text
 
-    @pytest.mark.parametrize("name", ["mask.jpg", "Mask.PNG"])
+    @pytest.mark.parametrize("name", ["mask.jpg", "Mask.PNG", "mask.bmp"])
     def test_a_mask_of_another_name_is_no_frame_and_it_is_said(self, frames, name, caplog) -> None:
         Image.fromarray(np.full((60, 80), 255, np.uint8)).save(frames / name)
         assert read(frames).frame_names == ("frame_1", "frame_2", "frame_10")
         assert f"{name} is not read; the mask of all frames is" in caplog.text
+        (told,) = (item for item in inspect(frames).findings if item.topic == "not read")
+        assert (told.field, name in told.sentence) == ("files", True)
 
     def test_a_mask_among_the_images_of_a_folder_below_is_said_to_be_unread(self, frames, caplog) -> None:
         (frames / "images").mkdir()

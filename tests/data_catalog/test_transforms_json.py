@@ -14,7 +14,7 @@ from data_catalog.catalog import read, resolve, source_fingerprint
 from data_catalog.readers.colmap_model import write_colmap
 from data_catalog.readers.transforms_json import write_transforms
 from extrags.config import IngestConfig
-from extrags.errors import SourceError, SourceNotFoundError
+from extrags.errors import PoseError, SourceError, SourceNotFoundError
 from extrags.sequence import Split
 from tests.data_catalog.layouts import carried_error_mm, same_frames
 
@@ -213,6 +213,16 @@ class TestReading:
         same_frames(found, replace(before, depth_mm=None), atol=ROUNDING)
         assert found.depth_mm is None
         assert found.points is None
+
+    def test_a_matrix_that_is_not_finite_is_named_as_it_stands_in_the_file(self, folder, edit) -> None:
+        def spoilt(content) -> None:
+            content["frames"][2]["transform_matrix"][1][3] = float("nan")
+
+        edit(spoilt)
+        with pytest.raises(PoseError, match="1 of 16 entries are NaN or infinite") as caught:
+            read(folder)
+        name = json.loads((folder / "transforms.json").read_text())["frames"][2]["file_path"]
+        assert (caught.value.field, caught.value.frame) == ("transform_matrix", name)
 
     @pytest.mark.parametrize("colored", [True, False])
     def test_points_that_are_not_finite_are_left_out(self, folder, edit, caplog, colored) -> None:

@@ -11,7 +11,7 @@ import pytest
 import torch
 from plyfile import PlyData, PlyElement
 
-from extrags.array_files import load_npz, load_ply_vertices, load_safetensors, save_safetensors
+from extrags.array_files import load_npz, load_ply_vertices, load_safetensors, save_npy, save_safetensors
 
 
 def test_tensors_of_any_layout_come_back(tmp_path: Path) -> None:
@@ -20,6 +20,13 @@ def test_tensors_of_any_layout_come_back(tmp_path: Path) -> None:
     found = load_safetensors(tmp_path / "new" / "x.safetensors")
     assert torch.equal(found["turned"], values.T)
     assert found["half"].dtype == torch.float16
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+def test_a_full_disk_is_said_as_the_system_says_it(tmp_path: Path) -> None:
+    (tmp_path / "depth.npy").symlink_to("/dev/full")
+    with pytest.raises(OSError, match="No space left on device"):
+        save_npy(tmp_path / "depth.npy", np.zeros((128, 160)))
 
 
 @pytest.mark.parametrize("umask", [0o022, 0o007])
