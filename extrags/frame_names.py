@@ -2,7 +2,8 @@
 
 Runs of digits are numbers: 9 comes before 10. Where two runs are joined by a point, as in `0.5` and `0.15`,
 they are two counts (0.5 comes before 0.15: frames 5 and 15 of series 0) or one decimal number (0.15 comes
-before 0.5). One name does not say which; the names of a folder do (`NameOrder`).
+before 0.5). One name does not say which; the names of a folder do (`NameOrder`). So do they where all are
+hexadecimal numbers: `0a` comes behind `09`, and not before `04`.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ logger = logging.getLogger(__name__)
 COLOR_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 
 _NUMBER = re.compile(r"\d+(?:\.\d+)*")
+_HEXADECIMAL = re.compile(r"[0-9a-fA-F]+")
 _JOINED = re.compile(r"\d\.\d")
 _FEWEST_STEPS = 3
 """Fewer tell nothing of a spacing."""
@@ -128,6 +130,8 @@ class NameOrder:
 
     What is then undecided is read as counts. It is `doubtful` where that makes another order.
 
+    Where all names are hexadecimal numbers of as many digits, and one of them has a letter, they are such.
+
     Args:
         names: of images, or their paths; each counts once.
     """
@@ -139,6 +143,10 @@ class NameOrder:
         self.doubtful: tuple[str, str] | None = None
         """Two names, the first of which is put before the second, and may come behind it."""
         distinct = sorted(set(names))
+        self.is_hexadecimal = _are_hexadecimal(distinct)
+        """Whether the names are hexadecimal numbers."""
+        if self.is_hexadecimal:
+            return
         parted = {name: _Parted.of(name) for name in distinct if _JOINED.search(name)}
         if not parted:
             return
@@ -153,17 +161,23 @@ class NameOrder:
 
     def key(self, name: str) -> tuple[_Key, str]:
         """Sort key of one of the names."""
+        if self.is_hexadecimal:
+            return _hexadecimal_key(name), name
         item = _Parted.of(name)
         return item.key(self._decimal.get(item.pattern, frozenset())), name
 
     def other_key(self, name: str) -> tuple[_Key, str]:
         """As `key`, with what is undecided read as decimals."""
+        if self.is_hexadecimal:
+            return self.key(name)
         item = _Parted.of(name)
         decimal = self._decimal.get(item.pattern, frozenset()) | self._open.get(item.pattern, frozenset())
         return item.key(decimal), name
 
     def number(self, name: str) -> Decimal | None:
         """The last number of a name, of counts the last of them; None without any."""
+        if self.is_hexadecimal:
+            return Decimal(int(_last_part(name), 16))
         item = _Parted.of(name)
         if not item.numbers:
             return None
@@ -175,6 +189,8 @@ class NameOrder:
 
     def numbers(self, name: str) -> tuple[Decimal, ...]:
         """All numbers of a name: a decimal is one of them, counts that are joined by points are several."""
+        if self.is_hexadecimal:
+            return (Decimal(int(_last_part(name), 16)),)
         item = _Parted.of(name)
         decimals = self._decimal.get(item.pattern, frozenset())
         parts = [
@@ -205,6 +221,30 @@ class NameOrder:
                 self.doubtful = self.doubtful or pair
         self._decimal[pattern] = frozenset(decimal)
         self._open[pattern] = frozenset(undecided)
+
+
+def _are_hexadecimal(names: Sequence[str]) -> bool:
+    """Whether names, without folder and suffix, are hexadecimal numbers of as many digits.
+
+    Some have a letter, else they are decimal, and some a digit of the ten, else they may be words.
+    """
+    bare = {_last_part(name) for name in names}
+    return (
+        len({len(name) for name in bare}) == 1
+        and all(_HEXADECIMAL.fullmatch(name) for name in bare)
+        and any(not name.isdecimal() for name in bare)
+        and any(not name.isalpha() for name in bare)
+    )
+
+
+def _hexadecimal_key(name: str) -> _Key:
+    folder, slash, _ = _stem(name).rpartition("/")
+    # All have as many digits, and digits come before letters.
+    return (*natural_key(folder + slash), (1, 0, _last_part(name).lower()))
+
+
+def _last_part(name: str) -> str:
+    return _stem(name).rpartition("/")[2]
 
 
 def _judged(items: Sequence[_Parted], place: int) -> _Reading | None:
@@ -314,12 +354,13 @@ def order_for_fingerprint(names: Iterable[str]) -> dict[str, Any]:
         names: of the images, or their paths.
 
     Returns:
-        Nothing where neither suffixes nor decimals make a difference to the order: earlier versions took
-        suffixes into account and knew no decimals, and their artefacts stay.
+        Nothing where neither suffixes nor decimals nor hexadecimal numbers make a difference to the order:
+        earlier versions took suffixes into account and knew neither of the others, and their artefacts stay.
     """
     listed = sorted(sorted(names), key=natural_key)
-    if sorted(listed, key=NameOrder(listed).key) != sorted(listed, key=file_key):
-        return {"order": "decimals"}
+    order = NameOrder(listed)
+    if sorted(listed, key=order.key) != sorted(listed, key=file_key):
+        return {"order": "hexadecimal" if order.is_hexadecimal else "decimals"}
     return {} if listed == sorted(listed, key=file_key) else {"order": "without suffixes"}
 
 

@@ -142,7 +142,10 @@ def _places(folder: Path) -> list[Path]:
 
 
 def _pictures(place: Path) -> list[Path]:
-    return [file for file in image_entries(place) if not is_mask(file)]
+    found = [file for file in image_entries(place) if not is_mask(file)]
+    # The name of a mask tells nothing of how frames are numbered.
+    order = NameOrder(file.name for file in found)
+    return sorted(found, key=lambda file: order.key(file.name))
 
 
 def _images(folder: Path, camera: StereoCamera = "left") -> FramesOfCamera | None:

@@ -190,6 +190,12 @@ class TestFrames:
         assert len(read(frames)) == 3
         assert "images/mask.png is not read; the mask of all frames is" in caplog.text
 
+    def test_a_mask_does_not_hide_hexadecimal_counts(self, frames) -> None:
+        for file, name in zip(sorted(frames.glob("*.png")), ("09", "10", "0a"), strict=True):
+            file.rename(frames / f"{name}.png")
+        Image.fromarray(np.full((60, 80), 255, np.uint8)).save(frames / "mask.png")
+        assert read(frames).frame_names == ("09", "0a", "10")
+
     def test_what_macos_leaves_beside_files_is_no_frame(self, frames) -> None:
         (frames / "._frame_1.png").write_bytes(b"\x00\x05\x16\x07")
         assert read(frames).frame_names == ("frame_1", "frame_2", "frame_10")

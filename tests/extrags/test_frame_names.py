@@ -94,6 +94,31 @@ def test_counts_stay_counts(names: list[str]) -> None:
     assert order_for_fingerprint(names) == {}
 
 
+def test_hexadecimal_numbers_have_their_place() -> None:
+    """0a to 0f were read before 04, as numbers without digits before them."""
+    names = named(20, lambda k: f"{k + 4:02x}")
+    assert sorted(shuffled(names), key=NameOrder(names).key) == names
+    assert order_for_fingerprint(names) == {"order": "hexadecimal"}
+    assert [NameOrder(names).number(name) for name in names] == [Decimal(k + 4) for k in range(20)]
+    paths = [f"{folder}/{k:03X}.png" for folder in ("p2", "p10") for k in range(8, 20)]
+    assert sorted(shuffled(paths), key=NameOrder(paths).key) == paths
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["9.png", "0a.png", "10.png"],
+        ["09.png", "10.png"],
+        ["f9.png", "f10.png"],
+        ["0a.png", "04.png", "0g.png"],
+        ["bad.png", "fed.png"],
+    ],
+)
+def test_other_names_are_no_hexadecimal_numbers(names: list[str]) -> None:
+    assert sorted(names, key=NameOrder(names).key) == sorted(names, key=file_key)
+    assert not NameOrder(names).is_hexadecimal
+
+
 def test_each_folder_and_each_kind_of_name_decides_for_itself() -> None:
     moments, series = DECIMALS["zeros dropped"], COUNTS["series"]
     names = [*(f"a/{name}" for name in moments), *(f"b/{name}" for name in series)]
