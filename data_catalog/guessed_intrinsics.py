@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from data_catalog.content import content_circle, framed_picture
+from data_catalog.content import Circle, FramedPicture, content_circle, framed_picture
 
 __all__ = ["ASSUMED_FIELD_OF_VIEW_DEG", "fitted_to_picture", "intrinsics_of_field_of_view"]
 
@@ -15,6 +15,8 @@ ASSUMED_FIELD_OF_VIEW_DEG = 90.0
 _MAX_OFFSET_SHARE = 0.2
 """A round picture whose centre is farther from the image's middle, in widths, is no lens's rim, unless a
 clear dark surround says so."""
+_SAME_RIM_SHARE = 0.03
+"""Of the width: so near to a circle's ends a picture ends whose rim it is."""
 
 
 def intrinsics_of_field_of_view(
@@ -56,13 +58,36 @@ def fitted_to_picture(
     if height != rows:
         seen = cv2.resize(seen, (width, height), interpolation=cv2.INTER_NEAREST)
     circle = content_circle(np.repeat(seen[None, :, :, None] * 255, 3, axis=3))
+    in_circle = None
     if circle is not None:
+        center = circle.center_x, circle.center_y * rows / height
+        in_circle = _fitted(K, center, 2 * circle.radius_px / width)
         offset = max(abs(circle.center_x - width / 2), abs(circle.center_y - height / 2))
         if offset <= _MAX_OFFSET_SHARE * width:
-            center = circle.center_x, circle.center_y * rows / height
-            return _fitted(K, center, 2 * circle.radius_px / width)
+            return in_circle
     picture = framed_picture(mask, rgb)
-    return K if picture is None else _fitted(K, picture.center, picture.width / width)
+    if picture is None:
+        return K
+    # The image may cut a round picture off, more above than below: its box has another centre then.
+    if circle is not None and in_circle is not None and _is_its_rim(circle, picture, (width, rows, height)):
+        return in_circle
+    return _fitted(K, picture.center, picture.width / width)
+
+
+def _is_its_rim(circle: Circle, picture: FramedPicture, sizes: tuple[int, int, int]) -> bool:
+    """Whether a picture ends where a circle does, or the image.
+
+    Args:
+        circle: in an image of square pixels.
+        picture: in the image as it is.
+        sizes: columns and rows of the image, and its rows where pixels are square.
+    """
+    width, rows, height = sizes
+    x, y, radius = circle.center_x, circle.center_y, circle.radius_px
+    ends = np.array([max(x - radius, 0), min(x + radius, width), max(y - radius, 0), min(y + radius, height)])
+    found = np.array([picture.left, picture.left + picture.width, picture.top, picture.top + picture.height])
+    found = found * np.array([1, 1, height / rows, height / rows])
+    return bool((np.abs(ends - found) <= _SAME_RIM_SHARE * width).all())
 
 
 def _fitted(

@@ -86,8 +86,17 @@ class TestBesideAPanel:
             (disc(148, 75, 46), (148, 75), 92),
             # Cut off above and below, at the right border of the frame.
             (disc(145, 75, 54) & box(slice(0, WIDTH), slice(25, 125)), (145, 75), 108),
+            # Cut off by the frame, above more than below.
+            (disc(145, 45, 50), (145, 45), 100),
         ],
-        ids=["rectangle", "octagon", "to the border", "circle", "cut circle"],
+        ids=[
+            "rectangle",
+            "octagon",
+            "to the border",
+            "circle",
+            "cut circle",
+            "cut above",
+        ],
     )
     def test_the_picture_is_the_lens(self, guess, mask, center, width) -> None:
         found = fitted(guess, mask)
