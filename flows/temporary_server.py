@@ -52,6 +52,8 @@ END_SECONDS = 2.0
 
 DATABASE = "prefect.db"
 """In Prefect's home."""
+SQLITE = "sqlite+aiosqlite:///"
+"""Begin of the addresses of such databases."""
 
 _starting: dict[str, subprocess.Popen[bytes]] = {}
 """The server that was started early, by its address; at most one."""
@@ -169,7 +171,7 @@ def _check_home() -> None:
 
     home = PREFECT_HOME.value()
     address = str(PREFECT_API_DATABASE_CONNECTION_URL.value())
-    if home.is_dir() and address.endswith((f"/{home / DATABASE}", f"/{_in_address(home / DATABASE)}")):
+    if home.is_dir() and address in (f"{SQLITE}{home / DATABASE}", _address(home / DATABASE)):
         _check_room(home)
 
 
@@ -279,9 +281,9 @@ def copy_database(source: Path, target: Path) -> bool:
         part.unlink(missing_ok=True)
 
 
-def _in_address(path: Path) -> str:
-    """A path as SQLAlchemy reads it in an address: it undoes percent escapes, and ends the path at `?`."""
-    return str(path).replace("%", "%25").replace("?", "%3F")
+def _address(path: Path) -> str:
+    """The address of a database: SQLAlchemy takes a path as it is, but ends it at `?`, unlike a URI's."""
+    return f"{SQLITE}file:{quote(str(path))}?uri=true" if "?" in str(path) else f"{SQLITE}{path}"
 
 
 def database_address(environment: Mapping[str, str]) -> dict[str, str]:
@@ -295,9 +297,10 @@ def database_address(environment: Mapping[str, str]) -> dict[str, str]:
     if home is None or any(name.startswith(chosen) for name in environment):
         return {}
     database = expanded(home) / DATABASE
-    if _in_address(database) == str(database):
+    address = _address(database)
+    if address == f"{SQLITE}{database}":
         return {}
-    return {"PREFECT_SERVER_DATABASE_CONNECTION_URL": f"sqlite+aiosqlite:///{_in_address(database)}"}
+    return {"PREFECT_SERVER_DATABASE_CONNECTION_URL": address}
 
 
 def _stop(process: subprocess.Popen[bytes]) -> None:
@@ -347,7 +350,7 @@ def _provide_database() -> None:
     database = PREFECT_HOME.value() / DATABASE
     address = str(PREFECT_API_DATABASE_CONNECTION_URL.value())
     # Another database, such as Postgres, is whose it is.
-    if database.exists() or not address.endswith(f"/{_in_address(database)}"):
+    if database.exists() or address != _address(database):
         return
     template = cache_directory() / f"prefect-{metadata.version('prefect')}.db"
     if copy_database(template, database):
@@ -360,9 +363,8 @@ def _provide_database() -> None:
     database.parent.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(dir=database.parent) as folder:
         made = Path(folder) / DATABASE
-        address_there = address.replace(_in_address(database), _in_address(made))
         with (
-            temporary_settings({PREFECT_API_DATABASE_CONNECTION_URL: address_there}),
+            temporary_settings({PREFECT_API_DATABASE_CONNECTION_URL: _address(made)}),
             # Else the server would go on with this one.
             temporary_database_config(None),
         ):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import signal
@@ -161,6 +162,30 @@ class TestServe:
         monkeypatch.setenv("EXTRAGS_STORE", "/data/special")
         with pytest.raises(ConfigError, match=rf"own\.yaml: deployment mine: .*{field}"):
             served_from(tmp_path, line)
+
+
+class TestSchedule:
+    def test_the_server_schedules_runs(self, prefect_server: None, monkeypatch: pytest.MonkeyPatch) -> None:
+        """By its own service, on its own database: there it broke with SQLAlchemy 2.1, in its log alone."""
+        from prefect.client.orchestration import get_client
+        from prefect.client.schemas.filters import DeploymentFilter, DeploymentFilterId
+        from prefect.server.services.scheduler import schedule_deployments
+
+        from flows.commands.serve import _deployment
+
+        monkeypatch.setenv("OMP_WAIT_POLICY", "passive")
+        (nightly,) = chosen_deployments(declared_deployments(usual_file()), ["nightly"])
+        deployed = _deployment(nightly, schedules=True).apply()
+        with get_client(sync_client=True) as client:
+            try:
+                asyncio.run(schedule_deployments())
+                own = DeploymentFilter(id=DeploymentFilterId(any_=[deployed]))
+                runs = client.read_flow_runs(deployment_filter=own)
+                assert {run.state_name for run in runs} == {"Scheduled"}
+                assert {run.expected_start_time.hour for run in runs if run.expected_start_time} == {2}
+            finally:
+                # With the runs that it has to come.
+                client.delete_deployment(deployed)
 
 
 def served_from(folder: Path, *lines: str) -> Any:

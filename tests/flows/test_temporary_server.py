@@ -59,14 +59,22 @@ def test_without_a_sound_template_there_is_no_copy(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("folder", ["a%20b", "100%", "why?", "%3F", "plain", "two words", "[é]#1"])
-def test_the_server_opens_the_database_in_its_home_whatever_that_is_called(folder: str) -> None:
+def test_the_server_opens_the_database_in_its_home_whatever_that_is_called(
+    folder: str, tmp_path: Path
+) -> None:
     from sqlalchemy import make_url
 
-    home = Path("/store") / folder / "prefect"
+    home = tmp_path / folder / "prefect"
+    home.mkdir(parents=True)
     given = database_address({"PREFECT_HOME": str(home)})
     # Without a variable, Prefect puts the path into the address as it is.
     (address,) = given.values() or (f"sqlite+aiosqlite:///{home / DATABASE}",)
-    assert make_url(address).database == str(home / DATABASE)
+    url = make_url(address)
+    (opened,), options = url.get_dialect()().create_connect_args(url)
+    with closing(sqlite3.connect(opened, uri=options.get("uri", False))) as database:
+        database.execute("CREATE TABLE words (word TEXT)")
+    assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == [DATABASE]
+    assert (home / DATABASE).is_file()
     assert set(given) <= {"PREFECT_SERVER_DATABASE_CONNECTION_URL"}
 
 
