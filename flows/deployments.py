@@ -72,12 +72,14 @@ class Declared:
         return ConfigError(f"{self.file}: deployment {self.name}: {what}")
 
     def flow(self) -> Any:
-        """Its flow, which has all of its parameters.
+        """Its flow, which takes all of its parameters.
 
         Raises:
-            ConfigError: for an entrypoint that is no flow of an installed module, or an unknown parameter.
+            ConfigError: for an entrypoint that is no flow of an installed module, and for an unknown
+                parameter or a value that the server would refuse.
         """
         from prefect import Flow
+        from prefect.utilities.schema_tools.validation import ValidationError, validate
 
         module, _, name = self.entrypoint.rpartition(".")
         try:
@@ -90,6 +92,13 @@ class Declared:
         for parameter in self.parameters:
             if parameter not in known:
                 raise self.error(f"parameters.{parameter}: {found.name} has {', '.join(known)}")
+        schema = found.parameters.model_dump_for_openapi()
+        try:
+            # As the server does when a run is asked for, which gives the parameters that are missing here.
+            validate(self.parameters, schema, raise_on_error=True, ignore_required=True)
+        except ValidationError as error:
+            place = getattr(error.__cause__, "json_path", "$").replace("$", "parameters", 1)
+            raise self.error(f"{place}: {getattr(error.__cause__, 'message', error)}") from error
         return found
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import os
 import warnings
+from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +25,8 @@ __all__ = ["add_arguments", "serve"]
 
 ENDED = "nothing is served any more; runs that were going on are interrupted, and what they finished is kept"
 PAUSED = f"{ENDED}; schedules are paused"
+REASON_LETTERS = 300
+"""Of what the server says about a deployment that it refuses."""
 
 
 def add_arguments(parser: Parser) -> None:
@@ -53,7 +57,8 @@ def serve(given: argparse.Namespace) -> int:
     """`extrags serve`; returns when it is interrupted.
 
     Raises:
-        ConfigError: without a server, for an unknown or ambiguous name, or a file that is wrong.
+        ConfigError: without a server, for an unknown or ambiguous name, a file that is wrong, or a deployment
+            that the server refuses.
     """
     from flows.deployments import chosen_deployments, declared_deployments, usual_file
 
@@ -75,16 +80,49 @@ def serve(given: argparse.Namespace) -> int:
             "extrags serve needs a Prefect server that lasts: start one (prefect server start), and set "
             "PREFECT_API_URL to its address, http://127.0.0.1:4200/api"
         )
+    made = [_deployment(item, schedules=given.schedules) for item in chosen]
+    _register(chosen, made, pause=given.schedules)
     say_when_interrupted(PAUSED if given.schedules else ENDED)
     # Prefect's handler of SIGTERM asks its runner to stop, and ends before that is awaited.
     warnings.filterwarnings("ignore", message="coroutine 'Runner.astop' was never awaited")
     prefect_serve(
-        *[_deployment(item, schedules=given.schedules) for item in chosen],
+        *made,
         limit=given.limit,
         # Schedules are as this command says, whatever they were before.
         pause_on_shutdown=given.schedules,
     )
     return 0
+
+
+def _register(chosen: Sequence[Declared], made: Sequence[Any], *, pause: bool) -> None:
+    """Register all deployments, or leave none of them on its schedule.
+
+    Prefect does it again when it serves them, and one by one: those before one that is refused stay active.
+
+    Args:
+        chosen: as they are declared.
+        made: what Prefect calls them.
+        pause: those that are registered, where one is refused.
+
+    Raises:
+        ConfigError: for one that the server refuses.
+    """
+    import httpx
+    from prefect.client.orchestration import get_client
+    from prefect.deployments.runner import DeploymentApplyError
+
+    registered = []
+    for declared, item in zip(chosen, made, strict=True):
+        try:
+            registered.append(item.apply())
+        except DeploymentApplyError as error:
+            # A server that is gone pauses nothing, and its refusal is what is to be told.
+            with suppress(httpx.HTTPError), get_client(sync_client=True) as client:
+                for identity in registered if pause else ():
+                    client.pause_deployment(identity)
+            # Prefect appends the schema of the flow, a page for each setting.
+            reason = str(error).partition("\n")[0][:REASON_LETTERS]
+            raise declared.error(f"the server refuses it: {reason}") from error
 
 
 def _deployment(declared: Declared, *, schedules: bool) -> Any:

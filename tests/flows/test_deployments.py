@@ -154,6 +154,15 @@ class TestServe:
             ("schedules: [{cron: '0 2 * *'}]", 'schedules: .*Invalid cron string: "0 2'),
             ("schedules: [{cron: '0 2 * * *', timezone: Europe/Bern}]", "schedules: .*Invalid timezone"),
             ("parameters: {sequence: phantom/0, settingz: {}}", r"parameters\.settingz: .*settings"),
+            ("parameters: {profile: quik}", r"parameters\.profile: 'quik' is not one of \['quick'"),
+            (
+                "parameters: {settings: {coarse.iterations: 0}}",
+                r"parameters\.settings\['coarse\.iterations'\]: 0 is less than the minimum of 1$",
+            ),
+            (
+                "parameters: {settings: {coarse.iteration: 3}}",
+                r"parameters\.settings: 'coarse\.iteration' is",
+            ),
         ],
     )
     def test_what_it_cannot_go_by_is_refused(
@@ -162,6 +171,39 @@ class TestServe:
         monkeypatch.setenv("EXTRAGS_STORE", "/data/special")
         with pytest.raises(ConfigError, match=rf"own\.yaml: deployment mine: .*{field}"):
             served_from(tmp_path, line)
+
+    def test_where_the_server_refuses_one_none_stays_on_its_schedule(
+        self,
+        prefect_server: None,
+        untouched_environment: None,
+        monkeypatch: pytest.MonkeyPatch,
+        tmp_path: Path,
+        capsys: pytest.CaptureFixture[str],
+    ) -> None:
+        from prefect.client.orchestration import get_client
+        from prefect.deployments.runner import DeploymentApplyError, RunnerDeployment
+
+        apply = RunnerDeployment.apply
+
+        def refused(deployment: RunnerDeployment) -> Any:
+            if deployment.name == "second":
+                raise DeploymentApplyError("1 validation error\n" + "a page of schema\n" * 10000)
+            return apply(deployment)
+
+        monkeypatch.setattr(RunnerDeployment, "apply", refused)
+        entry = (
+            "{name: %s, entrypoint: flows.sequence.reconstruct_sequence, schedules: [{cron: '0 2 * * *'}]}"
+        )
+        file = tmp_path / "own.yaml"
+        file.write_text(f"deployments: [{entry % 'first'}, {entry % 'second'}]")
+        assert main(["serve", "--file", str(file), "--schedules"]) == 2
+        said = capsys.readouterr().err
+        assert said == f"extrags: {file}: deployment second: the server refuses it: 1 validation error\n"
+        with get_client(sync_client=True) as client:
+            first = client.read_deployment_by_name("reconstruct-sequence/first")
+            client.delete_deployment(first.id)
+        assert first.paused
+        assert [item.active for item in first.schedules] == [True]
 
 
 class TestSchedule:
