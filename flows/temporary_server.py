@@ -9,7 +9,8 @@ It starts while its command still imports and looks (`start_early`), and does no
 every store: the first one on a machine is kept as a template, since Prefect's migrations take longer than all
 else.
 
-`python -m flows.temporary_server DESCRIPTOR` is the server; `temporary_server` starts it.
+`python -m flows.temporary_server DESCRIPTOR` is the server; `temporary_server` starts it. With `own` as a
+second argument Prefect's home is one of this project, where a damaged database gives way to a new one.
 """
 
 from __future__ import annotations
@@ -54,6 +55,11 @@ DATABASE = "prefect.db"
 """In Prefect's home."""
 SQLITE = "sqlite+aiosqlite:///"
 """Begin of the addresses of such databases."""
+DAMAGED = f"{DATABASE}.damaged"
+"""What a damaged one is called from then on; a former one of this name goes."""
+BESIDE = ("-wal", "-shm", "")
+"""What SQLite keeps beside a database, and last the database itself."""
+OWN = "own"
 
 _starting: dict[str, subprocess.Popen[bytes]] = {}
 """The server that was started early, by its address; at most one."""
@@ -87,7 +93,7 @@ def start_early() -> None:
             _check_room(Path(os.environ["PREFECT_HOME"]))
         except ServerError:
             return
-        address, process = _launch({})
+        address, process = _launch({}, own=True)
         _starting[address] = process
 
 
@@ -161,18 +167,24 @@ def _check_room(home: Path) -> None:
         ) from error
 
 
+def _database() -> Path | None:
+    """The database in Prefect's home; None where Prefect is to use another one, such as Postgres."""
+    from prefect.settings import PREFECT_API_DATABASE_CONNECTION_URL, PREFECT_HOME
+
+    database = PREFECT_HOME.value() / DATABASE
+    address = str(PREFECT_API_DATABASE_CONNECTION_URL.value())
+    return database if address in (f"{SQLITE}{database}", _address(database)) else None
+
+
 def _check_home() -> None:
     """As `_check_room`, where Prefect's home holds the database, and is there.
 
     Raises:
         ServerError: when it cannot be written.
     """
-    from prefect.settings import PREFECT_API_DATABASE_CONNECTION_URL, PREFECT_HOME
-
-    home = PREFECT_HOME.value()
-    address = str(PREFECT_API_DATABASE_CONNECTION_URL.value())
-    if home.is_dir() and address in (f"{SQLITE}{home / DATABASE}", _address(home / DATABASE)):
-        _check_room(home)
+    database = _database()
+    if database is not None and database.parent.is_dir():
+        _check_room(database.parent)
 
 
 def _start() -> str:
@@ -190,8 +202,13 @@ def _start() -> str:
     return address
 
 
-def _launch(settings: dict[str, str]) -> tuple[str, subprocess.Popen[bytes]]:
-    """Start the server: its address, at which nobody answers yet, and its process."""
+def _launch(settings: dict[str, str], *, own: bool = False) -> tuple[str, subprocess.Popen[bytes]]:
+    """Start the server: its address, at which nobody answers yet, and its process.
+
+    Args:
+        settings: of Prefect, beside those of the environment.
+        own: whether Prefect's home is one of this project.
+    """
     root = str(Path(__file__).resolve().parents[1])
     environment = {
         **os.environ,
@@ -218,7 +235,10 @@ def _launch(settings: dict[str, str]) -> tuple[str, subprocess.Popen[bytes]]:
         address = f"{origin}/api"
         environment |= dict.fromkeys(CORS_VARIABLES, origin)
         process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "flows.temporary_server", str(listener.fileno())],
+            [
+                *(sys.executable, "-P", "-m", "flows.temporary_server", str(listener.fileno())),
+                *([OWN] if own else []),
+            ],
             stdin=subprocess.PIPE,
             env=environment,
             pass_fds=[listener.fileno()],
@@ -237,7 +257,11 @@ def _wait(process: subprocess.Popen[bytes], address: str, limit_s: float) -> Non
         while time.monotonic() < end:
             if process.poll() is not None:
                 _check_home()
-                raise ServerError(f"Prefect's temporary server ended at once with code {process.returncode}")
+                database = _database()
+                hint = f"; it keeps runs, and no results, in {database}" if database is not None else ""
+                raise ServerError(
+                    f"Prefect's temporary server ended at once with code {process.returncode}{hint}"
+                )
             try:
                 if client.get(f"{address}/health").status_code == httpx.codes.OK:
                     return
@@ -281,6 +305,28 @@ def copy_database(source: Path, target: Path) -> bool:
         part.unlink(missing_ok=True)
 
 
+def _set_aside_if_damaged(database: Path) -> None:
+    """Rename a database that SQLite finds damaged, which no server could use, and say so."""
+    try:
+        with closing(sqlite3.connect(f"file:{quote(str(database))}?mode=ro", uri=True)) as opened:
+            if opened.execute("PRAGMA quick_check").fetchall() == [("ok",)]:
+                return
+    except sqlite3.OperationalError:
+        return  # It is locked, or not for this user to read: nothing is known of it.
+    except sqlite3.DatabaseError:
+        pass
+    # What is beside it first: left to a new database, its log would be taken for the log of that one.
+    for suffix in BESIDE:
+        with suppress(FileNotFoundError):
+            os.replace(f"{database}{suffix}", f"{database.with_name(DAMAGED)}{suffix}")
+    print(
+        f"extrags: Prefect's database {database} was damaged, and is now {DAMAGED} beside a new one; it held "
+        "runs, and no results",
+        file=sys.stderr,
+        flush=True,
+    )
+
+
 def _address(path: Path) -> str:
     """The address of a database: SQLAlchemy takes a path as it is, but ends it at `?`, unlike a URI's."""
     return f"{SQLITE}file:{quote(str(path))}?uri=true" if "?" in str(path) else f"{SQLITE}{path}"
@@ -313,8 +359,13 @@ def _stop(process: subprocess.Popen[bytes]) -> None:
         process.wait()
 
 
-def _serve(descriptor: int) -> None:
-    """Serve on a bound socket until standard input ends."""
+def _serve(descriptor: int, *, own: bool) -> None:
+    """Serve on a bound socket until standard input ends.
+
+    Args:
+        descriptor: of the socket.
+        own: whether Prefect's home is one of this project.
+    """
     serving: list[uvicorn.Server] = []
 
     def watch() -> None:
@@ -333,7 +384,7 @@ def _serve(descriptor: int) -> None:
     # After the thread has started: this takes seconds.
     import uvicorn
 
-    _provide_database()
+    _provide_database(own=own)
     config = uvicorn.Config(
         "prefect.server.api.server:create_app", factory=True, log_level="error", lifespan="on"
     )
@@ -343,14 +394,22 @@ def _serve(descriptor: int) -> None:
     os._exit(0)
 
 
-def _provide_database() -> None:
-    """See to it that Prefect's home has a database: a copy of the template, which is made if need be."""
+def _provide_database(*, own: bool) -> None:
+    """See to it that Prefect's home has a database: a copy of the template, which is made if need be.
+
+    Args:
+        own: whether the home is one of this project, where a damaged database gives way to a new one.
+    """
     from prefect.settings import PREFECT_API_DATABASE_CONNECTION_URL, PREFECT_HOME, temporary_settings
 
     database = PREFECT_HOME.value() / DATABASE
     address = str(PREFECT_API_DATABASE_CONNECTION_URL.value())
     # Another database, such as Postgres, is whose it is.
-    if database.exists() or address != _address(database):
+    if address != _address(database):
+        return
+    if own and database.exists():
+        _set_aside_if_damaged(database)
+    if database.exists():
         return
     template = cache_directory() / f"prefect-{metadata.version('prefect')}.db"
     if copy_database(template, database):
@@ -374,4 +433,4 @@ def _provide_database() -> None:
 
 
 if __name__ == "__main__":
-    _serve(int(sys.argv[1]))
+    _serve(int(sys.argv[1]), own=OWN in sys.argv[2:])

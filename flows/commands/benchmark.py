@@ -93,7 +93,7 @@ def benchmark(given: argparse.Namespace) -> int:
     """`extrags benchmark`; exit code 1 when a run failed, or is worse than is tolerated."""
     from extrags.config import profile_config
     from extrags.store import Store
-    from flows.environment import prepare, without_heartbeat
+    from flows.environment import has_own_home, prepare, without_heartbeat
 
     say_when_interrupted(RESUMABLE)
     terminal = is_terminal()
@@ -104,6 +104,7 @@ def benchmark(given: argparse.Namespace) -> int:
     profiles: Any = items(given.profiles)
     seeds = parsed_seeds(given.seeds)
     variants = parsed_variants(given.variants)
+    own_home = has_own_home()
     prepare(Store(root).state, debug=given.debug)
     from flows.benchmark import benchmark as flow
     from flows.benchmark import check_methods, check_repetitions
@@ -113,7 +114,7 @@ def benchmark(given: argparse.Namespace) -> int:
     from flows.progress_display import RunInView, progress_display
     from flows.selection import absolute_manifests, chosen_sequences
     from flows.settings import task_runner
-    from flows.temporary_server import temporary_server
+    from flows.temporary_server import start_early, temporary_server
 
     limits = stage_limits(given)
 
@@ -125,6 +126,8 @@ def benchmark(given: argparse.Namespace) -> int:
     ways = len(profiles) * len(seeds) * (len(methods) + len(variants))
     runs = len(chosen_sequences(given.sequences)) * ways
     view = RunInView(runs, expected_seconds(profile_config(profiles[0])), "evaluate", root)
+    if own_home:
+        start_early()
     with temporary_server(), without_heartbeat(), progress_display(showing(given), view):
         measure = flow.with_options(task_runner=task_runner(given.runner))
         try:

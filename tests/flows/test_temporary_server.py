@@ -5,7 +5,9 @@ from __future__ import annotations
 import resource
 import sqlite3
 import subprocess
+from collections.abc import Iterator
 from contextlib import closing
+from importlib import metadata
 from pathlib import Path
 
 import httpx
@@ -154,9 +156,75 @@ def test_a_server_that_ends_at_once_for_want_of_room(tmp_path: Path, monkeypatch
         server_module._wait(server, "http://127.0.0.1:9/api", 5)
     with (
         temporary_settings({**settings, PREFECT_HOME: tmp_path / "another"}),
-        pytest.raises(ServerError, match="ended at once with code 1"),
+        pytest.raises(ServerError, match=r"ended at once with code 1$"),
     ):
         server_module._wait(server, "http://127.0.0.1:9/api", 5)
+
+
+def test_a_server_that_ends_at_once_names_its_database(tmp_path: Path) -> None:
+    server = subprocess.Popen(["false"])
+    server.wait()
+    database = tmp_path / DATABASE
+    settings = {
+        PREFECT_HOME: tmp_path,
+        PREFECT_API_DATABASE_CONNECTION_URL: f"sqlite+aiosqlite:///{database}",
+    }
+    with (
+        temporary_settings(settings),
+        pytest.raises(ServerError, match=rf"code 1; it keeps runs, and no results, in {database}$"),
+    ):
+        server_module._wait(server, "http://127.0.0.1:9/api", 5)
+
+
+class TestDamaged:
+    """Databases of which a part has been overwritten, in a home of this project."""
+
+    @pytest.fixture
+    def home(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+        cache = tmp_path / "cache"
+        cache.mkdir()
+        monkeypatch.setattr(server_module, "cache_directory", lambda: cache)
+        made(cache / f"prefect-{metadata.version('prefect')}.db", "new")
+        home = tmp_path / "home"
+        home.mkdir()
+        database = home / DATABASE
+        settings = {
+            PREFECT_HOME: home,
+            PREFECT_API_DATABASE_CONNECTION_URL: f"sqlite+aiosqlite:///{database}",
+        }
+        with temporary_settings(settings):
+            yield home
+
+    @pytest.mark.parametrize("begin", [0, 4096])
+    def test_a_new_one_takes_its_place(
+        self, home: Path, begin: int, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        database = made(home / DATABASE, "old")
+        with database.open("r+b") as file:
+            file.seek(begin)
+            file.write(b"x" * 4096)
+        damaged = database.read_bytes()
+        (home / f"{DATABASE}-wal").write_bytes(b"its log")
+        server_module._provide_database(own=True)
+        assert words(database) == [("new",)]
+        assert (home / "prefect.db.damaged").read_bytes() == damaged
+        assert (home / "prefect.db.damaged-wal").exists() or begin
+        assert f"{database} was damaged, and is now prefect.db.damaged" in capsys.readouterr().err
+        server_module._provide_database(own=True)
+        assert capsys.readouterr().err == ""
+
+    def test_that_of_somebody_elses_home_stays(self, home: Path) -> None:
+        (home / DATABASE).write_bytes(b"no database" * 1000)
+        server_module._provide_database(own=False)
+        assert [file.name for file in home.iterdir()] == [DATABASE]
+
+    def test_one_that_is_in_use_stays(self, home: Path) -> None:
+        with closing(sqlite3.connect(made(home / DATABASE, "old"))) as other:
+            other.execute("PRAGMA locking_mode=EXCLUSIVE")
+            other.execute("INSERT INTO words VALUES ('more')")
+            server_module._provide_database(own=True)
+            other.commit()
+        assert words(home / DATABASE) == [("old",), ("more",)]
 
 
 @pytest.fixture
@@ -166,7 +234,7 @@ def given(monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
 
     class Process:
         def __init__(self, command: list[str], *, env: dict[str, str], **_: object) -> None:
-            found.update(env)
+            found.update(env, command=" ".join(command))
 
     monkeypatch.setattr(subprocess, "Popen", Process)
     monkeypatch.setattr(server_module.atexit, "register", lambda *_: None)
@@ -184,6 +252,19 @@ def test_pages_of_other_sites_are_told_nothing(
         monkeypatch.setenv(name, given[name])
     allowed = type(get_current_settings())().server.api.cors_allowed_origins
     assert allowed == address.removesuffix("/api")
+
+
+def test_a_home_of_this_project_is_known_to_its_server(
+    given: dict[str, str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(server_module, "_started", {})
+    monkeypatch.setattr(server_module, "_starting", {})
+    monkeypatch.delenv("PREFECT_API_URL", raising=False)
+    monkeypatch.setenv("PREFECT_HOME", str(tmp_path))
+    server_module.start_early()
+    assert given["command"].endswith(f" {server_module.OWN}")
+    server_module._launch({})
+    assert not given["command"].endswith(server_module.OWN)
 
 
 @pytest.mark.parametrize("support", ["true", "false"])
