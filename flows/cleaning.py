@@ -10,6 +10,7 @@ from extrags.errors import StoreError, reason_of
 from extrags.store import Store
 from extrags.store.retention import Cleaning, Policy, apply_policy, planned_removals
 from extrags.store.runs import sweep_unreadable
+from flows.outcome_records import sweep_outcomes
 from tasks.locks import sweep_locks
 
 __all__ = ["Cleaned", "clean_store"]
@@ -22,7 +23,8 @@ class Cleaned:
     """What went from a store, or would go.
 
     Args:
-        leftovers: names of what killed runs and failures left.
+        leftovers: names of what killed runs and failures left, and of records of how runs ended of which
+            nothing else is left.
         artefacts: what the policy says.
         problems: why something could not be done; all else was.
     """
@@ -73,4 +75,10 @@ def clean_store(store: Store, policy: Policy, *, dry_run: bool = False) -> Clean
     if cleaning is not None:
         done.artefacts = cleaning
         done.problems += cleaning.refused.values()
+    age = policy.older_than_s
+    if cleaning is not None and age is not None:
+        # Else a sequence that failed once, and is of no use any more, fails in `extrags status` for ever.
+        there = set(store.keys()) - {item.key for item in cleaning.removed}
+        swept = done.attempt(lambda: sweep_outcomes(store, age, there, dry_run=dry_run))
+        done.leftovers += [f"records/{name}.json" for name in swept or []]
     return done

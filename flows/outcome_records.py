@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import datetime
+import math
+import time
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from data_catalog.names import comparable_name
 from extrags.pipeline import HELD_OUT_TRAINED_ON
 from extrags.store import Store, read_records
+from extrags.store.artefact_names import matches
+from extrags.store.records import remove_record
 
 __all__ = [
     "OUTCOME",
@@ -17,8 +22,10 @@ __all__ = [
     "record_of",
     "recorded_name",
     "recorded_page",
+    "removable_outcomes",
     "report_key",
     "setting_text",
+    "sweep_outcomes",
     "told_apart",
 ]
 
@@ -45,6 +52,65 @@ def outcome_records(store: Store) -> dict[str, OutcomeRecord]:
         StoreError: when the store cannot be read.
     """
     return read_records(store, OUTCOME)
+
+
+def removable_outcomes(store: Store, pattern: str, *, here: str | None = None) -> list[str]:
+    """Names of the records of those sequences whose name or path a shell pattern means.
+
+    A relative path may be the name of several sequences: where it is the pattern, those in one place are
+    meant.
+
+    Args:
+        store: that holds them.
+        pattern: of the names.
+        here: absolute path that the pattern names for who gives it; None for none.
+
+    Raises:
+        StoreError: when the store cannot be read.
+    """
+    chosen = []
+    for name, record in outcome_records(store).items():
+        label, place = str(record["sequence"]), record.get("path")
+        elsewhere = pattern == label != place and place not in (None, here)
+        if matches(pattern, label, *([place] if place else [])) and not elsewhere:
+            chosen.append(name)
+    return chosen
+
+
+def sweep_outcomes(
+    store: Store, older_than_s: float, there: Collection[str], *, dry_run: bool = False
+) -> list[str]:
+    """Remove the records of runs that ended so long ago, and of which no artefact is left.
+
+    Args:
+        store: that holds them.
+        older_than_s: how long ago.
+        there: keys of the store's artefacts.
+        dry_run: remove nothing.
+
+    Returns:
+        Names of the records that are gone, or would be.
+
+    Raises:
+        StoreError: when the store cannot be read, or a record not be removed.
+    """
+    limit = time.time() - older_than_s
+    gone = []
+    for name, record in outcome_records(store).items():
+        keys = {key for row in record["stages"] for key in row["artefacts"]}
+        if _ended(record) < limit and keys.isdisjoint(there):
+            if not dry_run:
+                remove_record(store, name)
+            gone.append(name)
+    return gone
+
+
+def _ended(record: OutcomeRecord) -> float:
+    """Seconds since 1970; of a date that is none, it is not known to be long ago."""
+    try:
+        return datetime.datetime.fromisoformat(str(record["ended"])).timestamp()
+    except ValueError:
+        return math.inf
 
 
 def recorded_name(record: OutcomeRecord) -> str:

@@ -52,7 +52,9 @@ def add_arguments(parser: Parser) -> None:
     )
     add_store(made)
     add_json(made)
-    made = add_verb(verbs, "rm", rm, "remove artefacts")
+    made = add_verb(
+        verbs, "rm", rm, "remove artefacts, and of sequences the records of how their last runs ended"
+    )
     made.add_argument(
         "patterns", nargs="+", metavar="PATTERN", help="shell pattern over key, stage or sequence"
     )
@@ -236,6 +238,8 @@ def rm(given: argparse.Namespace) -> int:
             all else has been.
     """
     from data_catalog.names import path_of
+    from extrags.store.records import remove_record
+    from flows.outcome_records import removable_outcomes
 
     store = _looked_into(given)
     # Of all patterns before the first artefact goes: one that is refused leaves the store as it is.
@@ -244,6 +248,13 @@ def rm(given: argparse.Namespace) -> int:
         for given_as in given.patterns
         for pattern in _spellings(given_as)
         for key in store.removable(pattern, here=path_of(pattern))
+    )
+    # How the runs of these sequences ended: without their artefacts it would be told for ever.
+    outcomes = dict.fromkeys(
+        name
+        for given_as in given.patterns
+        for pattern in _spellings(given_as)
+        for name in removable_outcomes(store, pattern, here=path_of(pattern))
     )
     removed: list[str] = []
     problems: list[StoreError] = []
@@ -254,12 +265,21 @@ def rm(given: argparse.Namespace) -> int:
                 removed.append(key)
         except StoreError as error:
             problems.append(error)
-    if not removed and not problems:
+    forgotten = 0
+    for name in outcomes:
+        try:
+            remove_record(store, name)
+            forgotten += 1
+        except StoreError as error:
+            problems.append(error)
+    if not removed and not forgotten and not problems:
         raise StoreError(
             f"nothing in {store.root} matches {' or '.join(given.patterns)} (keys, stages and sequences as "
             "in extrags cache ls); nothing was removed"
         )
     print(f"{counted(len(removed), 'artefact')} removed from {store.root}")
+    if forgotten:
+        print(f"{counted(forgotten, 'record')} of how runs ended removed")
     if problems:
         more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
         raise StoreError(f"{problems[0]}{more}") from problems[0]

@@ -12,11 +12,17 @@ from prefect.exceptions import ParameterTypeError
 
 import flows.retention
 from extrags.errors import StoreError
-from extrags.store import Store
+from extrags.store import Store, write_record
 from extrags.store.directory import DirectoryBackend
+from extrags.store.retention import Policy
+from flows.cases import SequenceCase, record_outcome
 from flows.cleaning import clean_store
 from flows.cli import main
+from flows.outcome import failed_outcome
+from flows.outcome_records import outcome_records, removable_outcomes
 from flows.retention import retention
+from flows.store_status import store_status
+from tests.flows.tiny import TINY, tiny_config
 from tests.other_user import give_to_another_user
 
 
@@ -131,3 +137,57 @@ def test_ages_and_sizes_below_zero_are_refused(option: str, store: Store) -> Non
 @pytest.mark.usefixtures("untouched_environment")
 def test_a_size_beyond_all_bounds_is_refused(store: Store) -> None:
     assert main(["cache", "gc", "--max-size", f"{'9' * 400}GiB", "--store", store.root]) == 2
+
+
+class TestOutcomes:
+    """Records of how runs ended, of sequences that failed before anything was made of them."""
+
+    @pytest.fixture
+    def store(self, tmp_path: Path) -> Store:
+        made = Store(tmp_path / "store")
+        made.check_writable()
+        for sequence in ("phantom/0@sparse", "phantom/1@sparse"):
+            case = SequenceCase(sequence, profile="quick", settings=TINY)
+            record_outcome(made, case, failed_outcome(sequence, "it is empty"), "report", tiny_config())
+        return made
+
+    @pytest.mark.usefixtures("untouched_environment")
+    def test_they_go_with_their_sequence(self, store: Store, capsys: pytest.CaptureFixture[str]) -> None:
+        assert main(["status", "--store", store.root]) == 1
+        assert main(["cache", "rm", "phantom/0", "--store", store.root]) == 0
+        assert "1 record of how runs ended removed" in capsys.readouterr().out
+        assert [row.sequence for row in store_status(store).rows] == ["phantom/1@sparse"]
+        assert main(["cache", "rm", "phantom/0", "--store", store.root]) == 1
+        assert main(["cache", "rm", "phantom/*", "--store", store.root]) == 0
+        assert main(["status", "--store", store.root]) == 0
+
+    def test_those_of_a_sequence_of_that_name_elsewhere_stay(
+        self, store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        for place in ("a", "b"):
+            (tmp_path / place / "scan").mkdir(parents=True)
+            monkeypatch.chdir(tmp_path / place)
+            case = SequenceCase("scan", profile="quick", settings=TINY)
+            record_outcome(store, case, failed_outcome("scan", "it is empty"), "report", tiny_config())
+        here = str(tmp_path / "b" / "scan")
+        (found,) = removable_outcomes(store, "scan", here=here)
+        assert outcome_records(store)[found]["path"] == here
+        assert removable_outcomes(store, here) == [found]
+        assert removable_outcomes(store, "coarse") == []
+
+    @pytest.mark.parametrize("dry_run", [True, False])
+    def test_old_ones_go_when_nothing_is_left_of_their_run(self, store: Store, dry_run: bool) -> None:
+        kept, gone = outcome_records(store).items()
+        for name, record in (kept, gone):
+            write_record(store, name, record | {"ended": "2026-01-01T00:00:00.000000+00:00"})
+        with store.slot(stage="toy", version=1, key="toy-v1-x"):
+            pass
+        stages = [{**kept[1]["stages"][0], "artefacts": {"toy-v1-x": 1}}]
+        write_record(store, kept[0], kept[1] | {"stages": stages, "ended": "2026-01-01T00:00:00+00:00"})
+        young = {**gone[1], "sequence": "young"}
+        write_record(store, "outcome.young", young)
+        before = sorted(outcome_records(store))
+        assert clean_store(store, Policy(max_bytes=0)).leftovers == []
+        done = clean_store(store, Policy(older_than_s=86400.0), dry_run=dry_run)
+        assert done.leftovers == [f"records/{gone[0]}.json"]
+        assert sorted(outcome_records(store)) == ([kept[0], "outcome.young"] if not dry_run else before)
