@@ -15,7 +15,7 @@ from extrags.config import DEFAULT_PROFILE, PipelineConfig
 from extrags.errors import ConfigError, DamagedArtefactError, StoreError
 from extrags.metrics.registry import PROTOCOL_VERSION
 from extrags.stages import STAGES, StageName
-from extrags.store import Store, digest_of, read_records, write_record
+from extrags.store import Store, digest_of, write_record
 from extrags.store.records import remove_record
 from extrags.user_paths import absolute
 from flows.estimate import expected_seconds
@@ -261,7 +261,9 @@ def record_outcome(
         StoreError: when it cannot be read or written.
     """
     names = (case.record, case.former_record)
-    before = record_of({key: row for name in names for key, row in read_records(store, name).items()}, *names)
+    before = record_of(
+        {key: row for name in names for key, row in outcome_records(store, name).items()}, *names
+    )
     if before is not None and outcome.status != "failed" and _is_earlier(until, before["until"]):
         return
     failed = next((row for row in outcome.stages if row.state == "failed"), None)

@@ -41,6 +41,31 @@ READABLE_LETTERS = 190
 """Letters of a benchmark's name in the names of its records: file systems allow 255 in all."""
 
 
+class _Case(BaseModel):
+    method: str
+    profile: str
+    sequence: str
+    setting: str | None
+    seed: int | None
+    error: str | None
+    asked: str = ""
+    settings: str
+    seconds: float
+    processor_seconds: float | None = None
+    figures: dict[str, float]
+
+
+class _Entry(BaseModel):
+    """Of an entry, what is asked for: one damaged record must not stop every later run of its benchmark."""
+
+    name: str
+    when: str
+    commit: str | None
+    version: str
+    machine: dict[str, Any]
+    cases: list[_Case]
+
+
 class Tolerance(BaseModel):
     """How much worse than before a benchmark may be before its run counts as failed."""
 
@@ -152,12 +177,12 @@ def append_history(store: Store, entry: Mapping[str, Any]) -> str:
 
 
 def history_of(store: Store, name: str) -> list[dict[str, Any]]:
-    """All entries of a benchmark, the oldest first.
+    """All entries of a benchmark, the oldest first; damaged ones are left out.
 
     Raises:
         StoreError: when the store cannot be read.
     """
-    found = read_records(store, _prefix(name)).values()
+    found = read_records(store, _prefix(name), _Entry).values()
     return sorted((entry for entry in found if entry["name"] == name), key=lambda entry: entry["when"])
 
 

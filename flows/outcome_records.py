@@ -8,6 +8,8 @@ import time
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
+from pydantic import BaseModel
+
 from data_catalog.names import comparable_name
 from extrags.pipeline import HELD_OUT_TRAINED_ON
 from extrags.store import Store, read_records
@@ -45,13 +47,48 @@ that of `extrags.run_costs.Workload`. Of each stage
 those of processor time that the cost model expects on its reference machine."""
 
 
-def outcome_records(store: Store) -> dict[str, OutcomeRecord]:
-    """How the last run of each case ended, by the name of its record.
+class _Stage(BaseModel):
+    stage: str
+    state: str
+    reason: str
+    made_seconds: float
+    expected_cpu_s: float = 0.0
+    artefacts: dict[str, int]
+
+
+class _Outcome(BaseModel):
+    """Of `OutcomeRecord`, what is asked for: one damaged record must not stop the look at all others."""
+
+    sequence: str
+    path: str | None = None
+    method: str
+    profile: str
+    seed: int | None
+    variant: dict[str, Any]
+    settings: dict[str, Any] = {}
+    until: str
+    status: str
+    stage: str | None
+    reason: str
+    ended: str
+    config: str
+    size: dict[str, Any] | None = None
+    stages: list[_Stage]
+    metrics: dict[str, Any]
+    report: str | None
+
+
+def outcome_records(store: Store, name: str = OUTCOME) -> dict[str, OutcomeRecord]:
+    """How the last run of each case ended, by the name of its record; damaged ones are left out.
+
+    Args:
+        store: that holds them.
+        name: what their names begin with.
 
     Raises:
         StoreError: when the store cannot be read.
     """
-    return read_records(store, OUTCOME)
+    return read_records(store, name, _Outcome)
 
 
 def removable_outcomes(store: Store, pattern: str, *, here: str | None = None) -> list[str]:

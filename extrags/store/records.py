@@ -13,6 +13,8 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
+from pydantic import BaseModel, ValidationError
+
 from extrags.errors import StoreError, reason_of
 from extrags.store.artefacts import Store
 from extrags.store.directory import ABOUT, held_directories
@@ -22,6 +24,10 @@ __all__ = ["in_work", "read_records", "remove_record", "write_record"]
 log = logging.getLogger(__name__)
 
 _SUFFIX = ".json"
+
+
+class _Object(BaseModel):
+    """Any JSON object."""
 
 
 def write_record(store: Store, name: str, record: Mapping[str, Any]) -> None:
@@ -48,12 +54,15 @@ def write_record(store: Store, name: str, record: Mapping[str, Any]) -> None:
         ) from error
 
 
-def read_records(store: Store, prefix: str = "") -> dict[str, dict[str, Any]]:
-    """Records by name, in the order of their names; one that is no JSON is left out, with a warning.
+def read_records(
+    store: Store, prefix: str = "", shape: type[BaseModel] = _Object
+) -> dict[str, dict[str, Any]]:
+    """Records by name, in the order of their names; one that is damaged is left out, with a warning.
 
     Args:
         store: where they are.
         prefix: what their names begin with.
+        shape: the fields that each has, and what is in them; it may have others as well.
 
     Raises:
         StoreError: when the store cannot be read.
@@ -65,10 +74,21 @@ def read_records(store: Store, prefix: str = "") -> dict[str, dict[str, Any]]:
     found = {}
     for name, text in sorted(texts.items()):
         try:
-            found[name.removesuffix(_SUFFIX)] = dict(json.loads(text))
-        except (TypeError, ValueError) as error:
-            log.warning("the record %s of %s is damaged and passed over: %s", name, store.root, error)
+            record = json.loads(text)
+            shape.model_validate(record)
+        except ValidationError as error:
+            fault = error.errors()[0]
+            place = ".".join(map(str, fault["loc"]))
+            _pass_over(store, name, f"{place}: {fault['msg']}" if place else fault["msg"])
+        except ValueError as error:
+            _pass_over(store, name, str(error))
+        else:
+            found[name.removesuffix(_SUFFIX)] = record
     return found
+
+
+def _pass_over(store: Store, name: str, reason: str) -> None:
+    log.warning("the record %s of %s is damaged and passed over: %s", name, store.root, reason)
 
 
 def remove_record(store: Store, name: str) -> None:

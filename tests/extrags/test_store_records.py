@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from pydantic import BaseModel
 
 from extrags.errors import StoreError
 from extrags.store import Store, in_work, read_records, write_record
@@ -65,8 +66,26 @@ class TestRecords:
         write_record(store, "outcome.a", {"n": 2})
         store.backend.write_record("outcome.b.json", b"{")
         store.backend.write_record("outcome.c.json", b"3")
+        store.backend.write_record("outcome.d.json", b"[]")
         assert list(read_records(store)) == ["outcome.a"]
-        assert "outcome.b.json" in caplog.text
+        for name in "bcd":
+            assert f"outcome.{name}.json" in caplog.text
+
+    def test_one_without_its_fields_is_damaged(self, store: Store, caplog: pytest.LogCaptureFixture) -> None:
+        class Shape(BaseModel):
+            n: int
+            rows: list[dict[str, int]] = []
+
+        for name, record in {
+            "a": {"n": 2, "more": "x"},
+            "b": {},
+            "c": {"n": 1, "rows": [{"k": "?"}]},
+        }.items():
+            write_record(store, name, record)
+        assert read_records(store, shape=Shape) == {"a": {"n": 2, "more": "x"}}
+        assert "b.json of" in caplog.text
+        assert "is damaged and passed over: n: Field required" in caplog.text
+        assert "is damaged and passed over: rows.0.k: Input should be" in caplog.text
 
     def test_one_that_cannot_be_read_is_not_taken_for_gone(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from extrags.errors import ConfigError
 from extrags.metrics.registry import PROTOCOL_VERSION
 from extrags.report.benchmark import BenchmarkInputs, build_benchmark_report
-from extrags.store import Store
+from extrags.store import Store, write_record
 from flows.benchmark import benchmark
 from flows.cli import main
 from flows.history import (
@@ -205,6 +205,21 @@ class TestRecords:
         ]
         assert len(history_of(store, "weekly!")) == 1
         assert history_of(store, "week") == []
+
+    @pytest.mark.parametrize("lost", ["when", "cases", "figures"])
+    def test_a_damaged_one_is_left_out(
+        self, tmp_path: Path, lost: str, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        store = Store(tmp_path)
+        append_history(store, entry(day=1))
+        whole = entry(day=2)
+        cases = [{key: value for key, value in case.items() if key != lost} for case in whole["cases"]]
+        damaged = {key: value for key, value in (whole | {"cases": cases}).items() if key != lost}
+        # As `append_history` names it, which the damage comes after.
+        name = append_history(store, whole)
+        write_record(store, name, damaged)
+        assert [item["when"][:10] for item in history_of(store, "weekly")] == ["2026-01-01"]
+        assert f"{name}.json of {store.root} is damaged and passed over" in caplog.text
 
     def test_names_of_any_length_are_told_apart(self, tmp_path: Path) -> None:
         store = Store(tmp_path)

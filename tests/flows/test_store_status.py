@@ -17,9 +17,11 @@ from extrags.errors import UnknownSequenceError
 from extrags.stages import STAGES
 from extrags.store import Store, digest_of
 from extrags.store.runs import recorded_run
-from flows.cases import SequenceCase, record_outcome
+from flows.cases import SequenceCase, record_outcome, selected
 from flows.cli import main
+from flows.expectation import expectations
 from flows.outcome import SequenceOutcome, StageRow
+from flows.outcome_records import outcome_records
 from flows.runners import DirectRunner
 from flows.store_status import StageStatus, StatusRow, StoreStatus, store_status
 from flows.wiring import run_sequence
@@ -65,6 +67,22 @@ def test_what_was_removed_is_missing(store: Store) -> None:
     (row,) = store_status(store).rows
     assert row.state == "missing"
     assert [stage for stage, item in row.stages.items() if item.state == "missing"] == ["finetune"]
+
+
+@pytest.mark.parametrize("record", [[], {}, {"sequence": SEQUENCE}, "a stage lacks its artefacts"])
+def test_a_damaged_record_hides_no_other(
+    store: Store, record: object, caplog: pytest.LogCaptureFixture
+) -> None:
+    whole = next(iter(outcome_records(store).values()))
+    if isinstance(record, str):
+        record = whole | {"stages": [{**whole["stages"][0], "artefacts": None}]}
+    store.backend.write_record("outcome.damaged.json", json.dumps(record).encode())
+    (row,) = store_status(store).rows
+    assert (row.sequence, row.state) == (SEQUENCE, "done")
+    assert f"the record outcome.damaged.json of {store.root} is damaged and passed over" in caplog.text
+    (found,) = expectations([CASE], store.root, "report")
+    assert found.seconds == 0
+    assert selected([CASE], "failed", store.root, "report") == []
 
 
 def test_what_is_being_made(store: Store) -> None:
