@@ -111,11 +111,18 @@ class DirectoryBackend:
         return str(self.artefacts / key)
 
     def names(self) -> list[str]:
-        """All keys, sorted."""
+        """All keys, sorted; an entry of which nothing can be told is left out, with a warning."""
         try:
-            return sorted(entry.name for entry in os.scandir(self.artefacts) if entry.is_dir())
+            return sorted(entry.name for entry in os.scandir(self.artefacts) if self._is_directory(entry))
         except FileNotFoundError:
             return []
+
+    def _is_directory(self, entry: os.DirEntry[str]) -> bool:
+        try:
+            return entry.is_dir()
+        except OSError as error:  # Such as a link to itself.
+            log.warning("%s is left out: %s", entry.path, reason_of(error))
+            return False
 
     def path(self, ref: Ref, manifest: Manifest) -> Path:
         """The artefact's files on the local disk."""

@@ -295,6 +295,17 @@ class TestDirectory:
         assert put(store) == ref
         assert store.find("toy-v1-aa") == ref
 
+    def test_an_entry_of_which_nothing_can_be_told_is_left_out(
+        self, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        store = Store(tmp_path)
+        put(store)
+        loop = tmp_path / "artefacts" / "toy-v1-loop"
+        loop.symlink_to(loop)
+        assert store.keys() == ["toy-v1-aa"]
+        assert f"{loop} is left out: Too many levels of symbolic links" in caplog.text
+        assert [manifest.key for manifest in store.ls()] == ["toy-v1-aa"]
+
     def test_verify_sees_a_changed_byte(self, tmp_path: Path) -> None:
         store = Store(tmp_path)
         ref = put(store)
