@@ -130,7 +130,8 @@ class NameOrder:
 
     What is then undecided is read as counts. It is `doubtful` where that makes another order.
 
-    Where all names are hexadecimal numbers of as many digits, and one of them has a letter, they are such.
+    Where all names are hexadecimal numbers of as many digits, some with letters and some without, they are
+    such.
 
     Args:
         names: of images, or their paths; each counts once.
@@ -226,14 +227,15 @@ class NameOrder:
 def _are_hexadecimal(names: Sequence[str]) -> bool:
     """Whether names, without folder and suffix, are hexadecimal numbers of as many digits.
 
-    Some have a letter, else they are decimal, and some a digit of the ten, else they may be words.
+    Some have a letter, else they are decimal, and some have none, as ten of sixteen in a row: `a1` and `b1`
+    are of two series.
     """
     bare = {_last_part(name) for name in names}
     return (
         len({len(name) for name in bare}) == 1
         and all(_HEXADECIMAL.fullmatch(name) for name in bare)
         and any(not name.isdecimal() for name in bare)
-        and any(not name.isalpha() for name in bare)
+        and any(name.isdecimal() for name in bare)
     )
 
 

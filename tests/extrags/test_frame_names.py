@@ -112,6 +112,7 @@ def test_hexadecimal_numbers_have_their_place() -> None:
         ["f9.png", "f10.png"],
         ["0a.png", "04.png", "0g.png"],
         ["bad.png", "fed.png"],
+        ["a1.png", "b1.png", "c2.png"],
     ],
 )
 def test_other_names_are_no_hexadecimal_numbers(names: list[str]) -> None:
