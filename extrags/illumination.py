@@ -23,9 +23,11 @@ from extrags.raster.light import (
     COSINE_SOFTENING,
     SPREAD_MIN,
     CameraLight,
+    add_glare,
     apply_response,
     invert_response,
     light_gain,
+    remove_glare,
     specular_gain,
 )
 from extrags.zarr_io import new_group, open_group, read_array, write_array
@@ -38,8 +40,12 @@ INITIAL_COSINE = 0.5
 INITIAL_LOG_SHOULDER = 0.0
 INITIAL_SPECULAR = 0.1
 INITIAL_ROUGHNESS = 0.2
+INITIAL_GLARE = 0.02
 """Initial values of the parameters: moderate angular spread, partly Lambertian surfaces, a soft shoulder, a
-faint and broad specular lobe."""
+faint and broad specular lobe, hardly any glare."""
+
+_LATER = ("log_specular", "log_roughness", "log_glare")
+"""Parameters that lights of before there were highlights, or glare, do not have."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +63,7 @@ class NearFieldLight:
         log_shoulder: logarithm of the response's shoulder s, scalar; minus infinity is a linear response.
         log_specular: logarithm of the strength m of the specular lobe, scalar; minus infinity is none.
         log_roughness: logarithm of the lobe's roughness rho, scalar.
+        log_glare: logarithm of the veiling glare v, one per colour, [3]; minus infinity is none.
     """
 
     log_softening: Float[Tensor, ""]
@@ -71,6 +78,7 @@ class NearFieldLight:
     log_roughness: Float[Tensor, ""] = field(
         default_factory=lambda: torch.tensor(math.log(INITIAL_ROUGHNESS))
     )
+    log_glare: Float[Tensor, "3"] = field(default_factory=lambda: torch.full((3,), -math.inf))
 
     @classmethod
     def initial(
@@ -96,6 +104,7 @@ class NearFieldLight:
             cosine=torch.tensor(INITIAL_COSINE if config.cosine else 0.0),
             log_shoulder=torch.tensor(INITIAL_LOG_SHOULDER if config.response else -math.inf),
             log_specular=torch.tensor(math.log(INITIAL_SPECULAR) if config.specular else -math.inf),
+            log_glare=torch.full((3,), math.log(INITIAL_GLARE) if config.glare else -math.inf),
         )
 
     def camera_light(self, exposure: Float[Tensor, "c"]) -> CameraLight:
@@ -111,6 +120,7 @@ class NearFieldLight:
             self.reference_distance,
             self.log_specular.exp(),
             self.log_roughness.exp(),
+            self.log_glare.exp(),
         )
 
     def exposure(self, frame: int | None) -> Float[Tensor, ""]:
@@ -208,13 +218,32 @@ class NearFieldLight:
         """
         return specular_gain(points, normals, self._row(points))
 
-    def invert_response(self, rgb: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-        """Sensor signal of image values in [0, 1]: the inverse of the camera response."""
-        return invert_response(rgb, self.log_shoulder.exp().to(rgb))
+    def invert_response(self, rgb: Float[Tensor, "*b"], channel_axis: int = -1) -> Float[Tensor, "*b"]:
+        """What surfaces send to the sensor, from image values in [0, 1].
 
-    def apply_response(self, signal: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-        """Image values of a sensor signal: the camera response."""
-        return apply_response(signal, self.log_shoulder.exp().to(signal))
+        Glare is taken away and the camera response inverted; what is darker than the glare sends nothing.
+
+        Args:
+            rgb: image values.
+            channel_axis: which axis has the three colours.
+        """
+        clear = remove_glare(rgb, self._glare(rgb, channel_axis))
+        return invert_response(clear, self.log_shoulder.exp().to(rgb))
+
+    def apply_response(self, signal: Float[Tensor, "*b"], channel_axis: int = -1) -> Float[Tensor, "*b"]:
+        """Image values of what surfaces send to the sensor: the camera's response, and glare over it.
+
+        Args:
+            signal: the light from surfaces.
+            channel_axis: which axis has the three colours.
+        """
+        clear = apply_response(signal, self.log_shoulder.exp().to(signal))
+        return add_glare(clear, self._glare(signal, channel_axis))
+
+    def _glare(self, like: Float[Tensor, "*b"], channel_axis: int) -> Tensor:
+        shape = [1] * like.ndim
+        shape[channel_axis] = 3
+        return self.log_glare.exp().to(like).reshape(shape)
 
     def albedo(
         self,
@@ -224,7 +253,7 @@ class NearFieldLight:
         *,
         min_gain: float = 1e-3,
     ) -> Float[Tensor, "n 3"]:
-        """Albedo from image values: the response is inverted and the gain of the light divided out.
+        """Albedo from image values: response and glare are undone and the gain of the light divided out.
 
         Highlights are taken away where normals are given; without, nothing tells which surfaces have them.
 
@@ -239,7 +268,7 @@ class NearFieldLight:
             signal = (signal - self.specular_gain(points, normals)[:, None]).clamp_min(0)
         return signal / self.gain(points, normals).clamp_min(min_gain)[:, None]
 
-    def _row(self, like: Tensor) -> Float[Tensor, "14"]:
+    def _row(self, like: Tensor) -> Float[Tensor, "17"]:
         return self.camera_light(self.log_exposure.new_ones(1)).packed()[0].to(like)
 
     def parameters(self) -> dict[str, Tensor]:
@@ -253,6 +282,7 @@ class NearFieldLight:
             "log_shoulder": self.log_shoulder,
             "log_specular": self.log_specular,
             "log_roughness": self.log_roughness,
+            "log_glare": self.log_glare,
             "log_exposure": self.log_exposure,
         }
 
@@ -280,7 +310,6 @@ class NearFieldLight:
         """Read what `save` wrote, to the processor."""
         group = open_group(path)
         names = [name for name in cls.__dataclass_fields__ if name != "reference_distance"]
-        # Lights of before there were highlights have none.
-        names = [name for name in names if name in group or name not in ("log_specular", "log_roughness")]
+        names = [name for name in names if name in group or name not in _LATER]
         values = {name: torch.from_numpy(read_array(group, name)) for name in names}
         return cls(**values, reference_distance=float(group.attrs["reference_distance"]))  # type: ignore[arg-type]

@@ -25,6 +25,9 @@ class LightConfig(StageConfig):
     specular: bool = Field(
         True, description="learn strength and roughness of the highlights of a wet surface"
     )
+    glare: bool = Field(
+        True, description="learn what lens and tube scatter over the whole image, one value per colour"
+    )
     exposure: bool = Field(True, description="learn a gain per training frame")
     offset: bool = Field(True, description="learn where the lamp stands beside the lens")
     exponent: float = Field(
@@ -46,6 +49,13 @@ class LightConfig(StageConfig):
         ge=0,
         description="weight of the lamp's distance from the lens, in median training depths: without, "
         "tissue that is darker on one side moves the lamp",
+    )
+    glare_kept_from: float = Field(
+        0.055,
+        ge=0,
+        le=1,
+        description="what black has to show, in the mean of the colours, for glare to be kept; less is found "
+        "where there is none as well, and bends the fall-off",
     )
     exposure_learning_rate: float = Field(0.005, gt=0, description="of the exposure per frame")
     exposure_prior: float = Field(

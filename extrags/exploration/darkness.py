@@ -54,7 +54,8 @@ def lit_luminance(
         with torch.no_grad():
             turned = camera.world_from_camera[0, :3, :3]
             falloff = light.gain(torch.from_numpy(points @ turned)).numpy()
-            brightness = light.invert_response(torch.from_numpy(brightness).clamp(max=1.0)).numpy()
+            grey = torch.from_numpy(brightness).clamp(max=1.0)[..., None].expand(-1, -1, 3)
+            brightness = luminance(light.invert_response(grey).numpy())
     else:
         distance = np.linalg.norm(points, axis=-1)
         falloff = np.ones_like(distance)

@@ -250,7 +250,7 @@ class DirectStep:
         target: Target,
         *,
         sh_degree: int,
-        light: Float[np.ndarray, "14"] | None = None,
+        light: Float[np.ndarray, "17"] | None = None,
         dssim_weight: float = 0.2,
         photometric_weight: float = 1.0,
         loss_weight: float = 1.0,

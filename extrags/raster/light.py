@@ -9,15 +9,18 @@ frame, in reference distances), with normal n (its shortest axis), has signal x 
     \qquad \cos\beta = \frac{\mathbf n \cdot \mathbf d}{|\mathbf d|},
 
     S(\beta) = \left(\frac{\rho^2}{\rho^2 + (1 - \rho^2) \sin^2 \beta}\right)^2,
-    \qquad I = \frac{(1 + s) \, x}{1 + s \, x}
+    \qquad I = \sqrt{\left( \frac{(1 + s) \, x}{1 + s \, x} \right)^2 + v^2}
 
 with exposure g (one per colour channel), softening c and exponent e of the fall-off with distance, exponent k
 of the light's angular spread, exponent q of the cosine law at the surface, strength m and roughness rho of
-the specular lobe of a wet surface, and shoulder s of the camera response. The lobe is the GGX distribution of
+the specular lobe of a wet surface, shoulder s of the camera response, and veiling glare v, one per colour:
+light that lens and tube scatter over the whole image. It adds to the sensor's linear signal, of which the
+image shows about the square root; v is what a black surface shows. It does not grow with the exposure: glare
+is a share of the image's mean, which automatic exposure holds. The lobe is the GGX distribution of
 normals with its peak at one; since the light rides beside the lens, the direction half-way between both is
 that to the camera. It has the colour of the light. Normalisation: at the reference distance, on the axis and
-facing the light, x = g (a + m); and I = 1 for x = 1. With k = q = m = s = 0 this is the softened fall-off
-with distance alone.
+facing the light, x = g (a + m); without glare, I = 1 for x = 1. With k = q = m = s = v = 0 this is the
+softened fall-off with distance alone.
 
 Source: GGX after Walter et al., "Microfacet models for refraction through rough surfaces", EGSR 2007.
 """
@@ -36,15 +39,17 @@ __all__ = [
     "LEARNED_LENGTH",
     "ROW_LENGTH",
     "CameraLight",
+    "add_glare",
     "apply_response",
     "invert_response",
     "light_gain",
     "lit_colors",
+    "remove_glare",
     "shortest_axes",
     "specular_gain",
 ]
 
-LEARNED_LENGTH = 13
+LEARNED_LENGTH = 16
 """Numbers of a row that a light may learn; the last one, the reference distance, is a gauge."""
 ROW_LENGTH = LEARNED_LENGTH + 1
 
@@ -81,6 +86,7 @@ class CameraLight:
         specular: m, not negative, scalar; 0 is a surface without highlights, where the kernels give it no
             gradient.
         roughness: rho, scalar; held between `ROUGHNESS_MIN` and 1.
+        glare: v, not negative, one per colour, [3]; where it is 0 the kernels give it no gradient.
     """
 
     exposure: Float[Tensor, "c 3"]
@@ -93,24 +99,23 @@ class CameraLight:
     reference_distance: float
     specular: Float[Tensor, ""] = field(default_factory=lambda: torch.zeros(()))
     roughness: Float[Tensor, ""] = field(default_factory=lambda: torch.ones(()))
+    glare: Float[Tensor, "3"] = field(default_factory=lambda: torch.zeros(3))
 
-    def packed(self) -> Float[Tensor, "c 14"]:
+    def packed(self) -> Float[Tensor, "c 17"]:
         """One row per camera.
 
-        Exposure, softening, exponent, spread, cosine, offset, shoulder, specular, roughness, reference.
+        Exposure, softening, exponent, spread, cosine, offset, shoulder, specular, roughness, glare,
+        reference.
         """
         common = torch.cat(
             [
                 torch.stack([self.softening, self.exponent, self.spread, self.cosine]),
                 self.offset,
                 torch.stack(
-                    [
-                        self.shoulder,
-                        self.specular.to(self.shoulder),
-                        self.roughness.to(self.shoulder),
-                        self.shoulder.new_tensor(self.reference_distance),
-                    ]
+                    [self.shoulder, self.specular.to(self.shoulder), self.roughness.to(self.shoulder)]
                 ),
+                self.glare.to(self.shoulder),
+                self.shoulder.new_tensor([self.reference_distance]),
             ]
         )
         return torch.cat([self.exposure, common.expand(len(self.exposure), -1)], dim=1)
@@ -120,7 +125,7 @@ def lit_colors(
     albedo: Float[Tensor, "n 3"],
     points: Float[Tensor, "n 3"],
     normals: Float[Tensor, "n 3"],
-    light: Float[Tensor, "14"],
+    light: Float[Tensor, "17"],
 ) -> Float[Tensor, "n 3"]:
     """Image colours of Gaussians in one camera under its light.
 
@@ -132,11 +137,11 @@ def lit_colors(
     """
     signal = albedo * light_gain(points, normals, light)[:, None]
     signal = signal + specular_gain(points, normals, light)[:, None]
-    return apply_response(light[:3] * signal, light[10])
+    return add_glare(apply_response(light[:3] * signal, light[10]), light[13:16])
 
 
 def light_gain(
-    points: Float[Tensor, "*b 3"], normals: Float[Tensor, "*b 3"] | None, light: Float[Tensor, "14"]
+    points: Float[Tensor, "*b 3"], normals: Float[Tensor, "*b 3"] | None, light: Float[Tensor, "17"]
 ) -> Float[Tensor, "*b"]:
     """Gain of the light at points in the camera frame, at unit exposure and without highlights.
 
@@ -152,7 +157,7 @@ def light_gain(
 
 
 def specular_gain(
-    points: Float[Tensor, "*b 3"], normals: Float[Tensor, "*b 3"], light: Float[Tensor, "14"]
+    points: Float[Tensor, "*b 3"], normals: Float[Tensor, "*b 3"], light: Float[Tensor, "17"]
 ) -> Float[Tensor, "*b"]:
     """What highlights add to the signal of a surface of any albedo, at unit exposure.
 
@@ -172,7 +177,7 @@ def specular_gain(
 
 
 def _from_lamp(
-    points: Float[Tensor, "*b 3"], light: Float[Tensor, "14"]
+    points: Float[Tensor, "*b 3"], light: Float[Tensor, "17"]
 ) -> tuple[Float[Tensor, "*b 3"], Float[Tensor, "*b"]]:
     """Where points are as the lamp sees them, in reference distances, and the square of how far."""
     offset = points / light[-1] - light[7:10]
@@ -180,7 +185,7 @@ def _from_lamp(
 
 
 def _log_arriving(
-    offset: Float[Tensor, "*b 3"], square: Float[Tensor, "*b"], light: Float[Tensor, "14"]
+    offset: Float[Tensor, "*b 3"], square: Float[Tensor, "*b"], light: Float[Tensor, "17"]
 ) -> Float[Tensor, "*b"]:
     """Logarithm to base two of the light that arrives, whichever way the surface faces."""
     softening, exponent, spread = light[3:6]
@@ -198,6 +203,23 @@ def apply_response(signal: Float[Tensor, "*b"], shoulder: Float[Tensor, ""]) -> 
 def invert_response(image: Float[Tensor, "*b"], shoulder: Float[Tensor, ""]) -> Float[Tensor, "*b"]:
     """Inverse of `apply_response`: the signal x of image values I in [0, 1]."""
     return image / (1 + shoulder * (1 - image))
+
+
+def add_glare(image: Float[Tensor, "*b"], glare: Float[Tensor, "*c"]) -> Float[Tensor, "*b"]:
+    """Image values under veiling glare, from those without: squares add up.
+
+    Args:
+        image: not negative.
+        glare: what black shows, broadcast to the image.
+    """
+    squared = image.square() + glare.square()
+    # The root has no slope at zero.
+    return torch.where(glare == 0, image, torch.where(squared > 0, squared, 1).sqrt())
+
+
+def remove_glare(image: Float[Tensor, "*b"], glare: Float[Tensor, "*c"]) -> Float[Tensor, "*b"]:
+    """Inverse of `add_glare`; what is darker than the glare is black."""
+    return torch.where(glare == 0, image, (image.square() - glare.square()).clamp_min(0).sqrt())
 
 
 def shortest_axes(quats: Float[Tensor, "n 4"], scales: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:

@@ -103,7 +103,7 @@ class RasterInputs:
     Ks: Float[Tensor, "c 3 3"]
     background: Float[Tensor, "c 3"] | Float[Tensor, "3"] | None
     query_points: Float[Tensor, "q 3"] | None
-    light: Float[Tensor, "c 14"] | None = None
+    light: Float[Tensor, "c 17"] | None = None
     visibility_mask: Float[Tensor, "c h w"] | None = None
 
 

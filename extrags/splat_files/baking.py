@@ -14,7 +14,7 @@ from extrags.cameras import Cameras
 from extrags.errors import ConfigError
 from extrags.gaussians import SH_C0, Gaussians
 from extrags.illumination import NearFieldLight
-from extrags.raster.light import shortest_axes
+from extrags.raster.light import apply_response, shortest_axes
 from extrags.scene import Scene
 from extrags.shown_pixels import chosen_masks, shown_pixels
 
@@ -122,7 +122,11 @@ def _lit(
     if shine is not None:
         signal = signal + shine[:, None, None]
     slope = gain * (1 + shoulder) / (1 + shoulder * signal) ** 2
-    return _with_colors(gaussians, light.apply_response(signal), slope * gaussians.shN)
+    color = light.apply_response(signal)
+    clear = apply_response(signal, shoulder)
+    # Of the root of the sum of squares; a clean lens adds nothing, not even where it is black.
+    veiled = torch.where(color > clear, clear / color.clamp_min(1e-12), 1)
+    return _with_colors(gaussians, color, veiled * slope * gaussians.shN)
 
 
 def _with_colors(

@@ -23,9 +23,10 @@ __all__ = ["read_ply_scene", "write_ply_scene"]
 
 _MARK = "extrags_light "
 _LINE_BYTES = 200
-_BY_VALUE = ("exponent", "shoulder", "specular")
+_BY_VALUE = ("exponent", "shoulder", "specular", "glare")
 """Written as they are, not as logarithms: light without fall-off has an exponent of zero, a linear response a
-shoulder of zero, a surface without highlights a strength of zero, and JSON cannot say minus infinity."""
+shoulder of zero, a surface without highlights a strength of zero, a clean lens a glare of zero, and JSON
+cannot say minus infinity."""
 _HEADER_BYTES = 1 << 22
 
 
@@ -46,7 +47,8 @@ def write_ply_scene(scene: Scene, path: Path) -> None:
         name: value.tolist() for name, value in scene.light.detached().parameters().items()
     }
     for name in _BY_VALUE:
-        values[name] = math.exp(values.pop(f"log_{name}"))
+        values[name] = scene.light.detached().parameters()[f"log_{name}"].double().exp().tolist()
+        del values[f"log_{name}"]
     values["reference_distance"] = scene.light.reference_distance
     text = json.dumps(values, allow_nan=False, separators=(",", ":"))
     # In several lines: readers keep a line of the header in a buffer of about a thousand bytes.
@@ -77,6 +79,8 @@ def read_ply_scene(path: Path) -> Scene:
     return Scene(gaussians, _light(b"".join(parts), path) if parts else None)
 
 
+_COLORS = ("glare",)
+"""Those of `_BY_VALUE` that have one value per colour."""
 _SHAPES: dict[str, tuple[int, ...] | None] = {
     "log_softening": (),
     "log_exposure": None,
@@ -86,8 +90,8 @@ _SHAPES: dict[str, tuple[int, ...] | None] = {
     "log_roughness": (),
 }
 """Parameters of the light, and how many numbers each is; None: any, one after the other."""
-_LATER = {"specular": 0.0, "log_roughness": math.log(INITIAL_ROUGHNESS)}
-"""What files of before there were highlights leave out, and what it was then."""
+_LATER = {"specular": 0.0, "log_roughness": math.log(INITIAL_ROUGHNESS), "glare": [0.0, 0.0, 0.0]}
+"""What files of before there were highlights, or glare, leave out, and what it was then."""
 
 
 def _light(text: bytes, path: Path) -> NearFieldLight:
@@ -96,7 +100,7 @@ def _light(text: bytes, path: Path) -> NearFieldLight:
         if "log_exponent" in values:  # as files of before have it
             values["exponent"] = math.exp(values.pop("log_exponent"))
         reference = float(values.pop("reference_distance"))
-        strengths = {name: float(values.pop(name)) for name in _BY_VALUE}
+        strengths = {name: torch.tensor(values.pop(name), dtype=torch.float64) for name in _BY_VALUE}
         tensors = {name: torch.tensor(value, dtype=torch.float32) for name, value in values.items()}
     except (ValueError, TypeError, KeyError, AttributeError, RuntimeError, OverflowError) as error:
         raise SourceError(
@@ -121,11 +125,13 @@ def _light(text: bytes, path: Path) -> NearFieldLight:
             field="extrags_light.reference_distance",
         )
     for name, value in strengths.items():
-        if not (math.isfinite(value) and value >= 0):
+        expected = "three numbers" if name in _COLORS else "a number"
+        fits = tuple(value.shape) == ((3,) if name in _COLORS else ())
+        if not (fits and bool((value.isfinite() & (value >= 0)).all())):
             raise SourceError(
-                f"the light's {name} is {value:g}, expected a number from 0 on",
+                f"the light's {name} is {value.tolist()}, expected {expected} from 0 on",
                 file=path,
                 field=f"extrags_light.{name}",
             )
-        tensors[f"log_{name}"] = torch.tensor(math.log(value) if value > 0 else -math.inf)
+        tensors[f"log_{name}"] = value.log().float()
     return NearFieldLight(**tensors, reference_distance=reference)

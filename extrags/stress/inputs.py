@@ -66,7 +66,7 @@ class LitScene:
         K: [3, 3].
         target: [H, W, 3].
         depth: [H, W].
-        light: a row of `CameraLight.packed`, [14]; None without light.
+        light: a row of `CameraLight.packed`, [17]; None without light.
     """
 
     parameters: dict[str, Tensor]
@@ -114,7 +114,9 @@ def lit_tube(n: int = 200, width: int = 40, height: int = 32, *, seed: int = 3, 
     generator = torch.Generator().manual_seed(seed)
     depth = 1.0 + 5 * torch.rand(height, width, generator=generator)
     depth[torch.rand(height, width, generator=generator) < 0.2] = 0
-    light = torch.tensor([1.3, 1.1, 0.9, 0.05, 1.0, 1.5, 0.8, 0.05, -0.04, 0.02, 0.6, 0.2, 0.15, 2.0])
+    light = torch.tensor(
+        [1.3, 1.1, 0.9, 0.05, 1.0, 1.5, 0.8, 0.05, -0.04, 0.02, 0.6, 0.2, 0.15, 0.1, 0.05, 0.07, 2.0]
+    )
     parameters = {
         "means": base["means"],
         "quats": base["quats"],
@@ -187,7 +189,9 @@ def random_lit_scene(seed: int, *, wild: bool = False) -> LitScene:
         "opacities": logits,
         "sh": sh * float(log_uniform(1e-3, 1e3)) if wild else sh,
     }
-    return LitScene(parameters, viewmat, K, uniform(0.0, 1.0, height, width, 3), truth, light)
+    target = uniform(0.0, 1.0, height, width, 3)
+    light = torch.cat([light[:-1], log_uniform(1e-3, 0.5, 3), light[-1:]])
+    return LitScene(parameters, viewmat, K, target, truth, light)
 
 
 def plane_views(

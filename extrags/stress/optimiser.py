@@ -233,7 +233,9 @@ def _drift_scene(lit: bool) -> LitScene:
         [0.5 + 0.4 * torch.sin(0.7 * columns + c) * torch.cos(0.5 * rows - c) for c in range(3)], -1
     )
     light = (
-        torch.tensor([1.2, 1.0, 0.9, 0.05, 1.0, 1.0, 0.6, 0.02, -0.02, 0.0, 0.5, 0.2, 0.15, 1.5])
+        torch.tensor(
+            [1.2, 1.0, 0.9, 0.05, 1.0, 1.0, 0.6, 0.02, -0.02, 0.0, 0.5, 0.2, 0.15, 0.1, 0.05, 0.07, 1.5]
+        )
         if lit
         else None
     )

@@ -131,6 +131,7 @@ def _light(row: Tensor) -> CameraLight:
         float(row[-1].detach()),
         row[11],
         row[12],
+        row[13:16],
     )
 
 

@@ -19,6 +19,7 @@ __all__ = [
     "LOG_ROUGHNESS_BOUNDS",
     "DenseAdam",
     "LightFit",
+    "drop_faint_glare",
     "lamp_distance",
     "learned_parameters",
     "learning_rate",
@@ -33,6 +34,7 @@ COMMON = (
     "log_shoulder",
     "log_specular",
     "log_roughness",
+    "log_glare",
 )
 """Parameters all cameras share, in the order of `CameraLight.packed`; the exposure comes before them."""
 BESIDE = (1.0, 1.0, 0.0)
@@ -55,6 +57,7 @@ def learned_parameters(config: LightConfig) -> list[str]:
         "log_shoulder": config.response,
         "log_specular": config.specular,
         "log_roughness": config.specular,
+        "log_glare": config.glare,
     }
     return [name for name, free in switches.items() if free]
 
@@ -65,6 +68,18 @@ def learning_rate(name: str, config: LightConfig) -> float:
         return config.offset_learning_rate
     specular = name in ("log_specular", "log_roughness")
     return config.specular_learning_rate if specular else config.learning_rate
+
+
+@torch.no_grad()
+def drop_faint_glare(light: NearFieldLight, config: LightConfig) -> None:
+    """Take glare away, in place and for good, where black would hardly show it (`config.glare_kept_from`).
+
+    Args:
+        light: whose tensors are being learned.
+        config: has the bound.
+    """
+    if float(light.log_glare.exp().mean()) < config.glare_kept_from:
+        light.log_glare.fill_(-math.inf)
 
 
 def lamp_distance(offset: Float[Tensor, "3"]) -> Float[Tensor, ""]:
@@ -115,6 +130,7 @@ class _Slots:
     begin: int
     end: int
     logarithm: bool
+    scalar: bool
 
 
 class LightFit:
@@ -133,8 +149,10 @@ class LightFit:
         parts = []
         begin = 0
         for name in COMMON:
-            part = values[name].detach().reshape(-1).float()
-            self._slots[name] = _Slots(begin, begin + len(part), name.startswith("log_"))
+            value = values[name].detach().float()
+            part = value.reshape(-1)
+            logarithm = name.startswith("log_")
+            self._slots[name] = _Slots(begin, begin + len(part), logarithm, value.ndim == 0)
             begin += len(part)
             parts.append(part)
         # The tensors and the arrays below are the same memory.
@@ -162,14 +180,14 @@ class LightFit:
     def light(self) -> NearFieldLight:
         """The light as it is now; it changes with the next step."""
         values = {
-            name: self._tensor[slots.begin : slots.end] if name == "offset" else self._tensor[slots.begin]
+            name: self._tensor[slots.begin] if slots.scalar else self._tensor[slots.begin : slots.end]
             for name, slots in self._slots.items()
         }
         return NearFieldLight(
             **values, log_exposure=self._exposures, reference_distance=self._reference_distance
         )
 
-    def row(self, frame: int | None) -> Float[np.ndarray, "14"]:
+    def row(self, frame: int | None) -> Float[np.ndarray, "17"]:
         """What the camera of a training frame carries; None is the mean exposure.
 
         Returns:
@@ -200,7 +218,7 @@ class LightFit:
         exposures = self._log_exposure
         return term + self._config.exposure_prior * float(exposures @ exposures) / len(exposures)
 
-    def step(self, gradient: Float[np.ndarray, "14"], rate_share: float = 1.0) -> None:
+    def step(self, gradient: Float[np.ndarray, "17"], rate_share: float = 1.0) -> None:
         """Step what is learned.
 
         Args:
@@ -215,7 +233,7 @@ class LightFit:
         if self._config.exposure and self._frame is not None:
             self._exposure_adam.step(self.exposure_gradient(gradient), rate_share)
 
-    def common_gradient(self, gradient: Float[np.ndarray, "14"]) -> Float[np.ndarray, "10"]:
+    def common_gradient(self, gradient: Float[np.ndarray, "17"]) -> Float[np.ndarray, "13"]:
         """Gradient of the parameters all cameras share, with that of the prior; zero where not learned."""
         common: np.ndarray = gradient[3:-1] * self._free
         if self._config.offset and self._config.offset_prior > 0:
@@ -225,7 +243,7 @@ class LightFit:
         np.multiply(common, self._row[3:-1], out=common, where=self._logarithms)
         return common
 
-    def exposure_gradient(self, gradient: Float[np.ndarray, "14"]) -> Float[np.ndarray, "f"]:
+    def exposure_gradient(self, gradient: Float[np.ndarray, "17"]) -> Float[np.ndarray, "f"]:
         """Gradient of the log-exposures, that of the prior included; the last row was of a real frame."""
         count = len(self._log_exposure)
         carried = float(gradient[:3].sum()) * float(self._row[0])

@@ -18,6 +18,7 @@ from extrags.scene import Scene
 from extrags.threads import one_torch_thread
 from extrags.training.footprint import APPLIED_EVERY, SmallestFootprint
 from extrags.training.frame_weights import FrameWeights
+from extrags.training.light_fit import drop_faint_glare
 from extrags.training.pose_refinement import PoseRefinement, RefinedPoses
 from extrags.training.schedule import Schedule
 from extrags.training.step import Observation, TrainingStep, training_step
@@ -103,6 +104,8 @@ def optimise(
                 raise DivergedError(_account(schedule, iteration, adam.parameters, step.light), last_good)
             step.update(observation, iteration)
             density.step(adam, observation.rendering, iteration)
+            if iteration == schedule.glare_decided_at and step.light is not None:
+                drop_faint_glare(step.light, schedule.light)
             last = iteration == schedule.iterations - 1
             if footprint is not None and (last or (iteration + 1) % APPLIED_EVERY == 0):
                 footprint.apply(adam.parameters)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -31,6 +32,9 @@ from extrags.training.views import epochs
 __all__ = ["coarse_schedule", "reconstruct", "refines_poses", "scene_extent", "smallest_footprint"]
 
 logger = logging.getLogger(__name__)
+
+GLARE_TRIAL_SHARE = 0.4
+"""Of the iterations, after which it is decided whether there is any: it is found early."""
 
 
 @one_torch_thread()
@@ -98,6 +102,8 @@ def reconstruct(
     schedule = coarse_schedule(config, scene_extent(sequence, chosen), depth, stage)
     if earlier is not None:
         schedule = continued_schedule(schedule, earlier.iterations)
+    elif config.light.glare:
+        schedule = replace(schedule, glare_decided_at=int(GLARE_TRIAL_SHARE * schedule.iterations))
     if config.normal_weight > 0:
         points = start.gaussians.means.numpy()
         schedule = replace(schedule, normals=NormalTerm.at(points, config, schedule.iterations))
@@ -111,6 +117,12 @@ def reconstruct(
         poses=poses,
         footprint=smallest_footprint(config, cameras),
     )
+    if (light := result.scene.light) is not None and bool((light.log_glare > -math.inf).any()):
+        logger.info(
+            "%s: veiling glare; black shows as %s",
+            sequence.name,
+            " ".join(f"{value:.2f}" for value in light.log_glare.exp().tolist()),
+        )
     if config.one_sided:
         # Refined poses differ by far too little to change a side.
         result = replace(result, scene=with_facing(result.scene, [cameras]))

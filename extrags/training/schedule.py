@@ -41,6 +41,8 @@ class Schedule:
     normals: NormalTerm | None = None
     light_cooldown_share: float = 0.0
     """Of the iterations, the last ones, in which the light's rates fall to `LIGHT_COOLDOWN_FINAL`."""
+    glare_decided_at: int | None = None
+    """Iteration after which glare stays only where there is enough of it (`LightConfig.glare_kept_from`)."""
     iterations_before: int = 0
     """Of earlier rounds of the same stage: its progress counts them."""
     iterations_after: int = 0

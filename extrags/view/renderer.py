@@ -221,7 +221,14 @@ class SceneRenderer:
         else:
             if not settings.falloff:
                 none = torch.tensor(-math.inf)
-                light = replace(light, log_exponent=none, spread=zero, cosine=zero, log_specular=none)
+                light = replace(
+                    light,
+                    log_exponent=none,
+                    spread=zero,
+                    cosine=zero,
+                    log_specular=none,
+                    log_glare=none.expand(3),
+                )
             made = light.camera_light(torch.tensor([settings.exposure * settings.lamp]))
         moved = {
             name: value.to(self.device) for name, value in vars(made).items() if name != "reference_distance"

@@ -291,7 +291,7 @@ def condition(layers: Layers, transfer: LightTransfer, *, folded: bool = True) -
     # However faint the evidence is, it has a colour of its own.
     solid = _within_range(color / known.clamp_min(torch.finfo(known.dtype).tiny))
     base = _within_range(
-        transfer.apply_response(push_pull(transfer.invert_response(solid) / falloff, known) * falloff)
+        transfer.apply_response(push_pull(transfer.invert_response(solid, 1) / falloff, known) * falloff, 1)
     )
     blend = _normalised(layers.get("blend")) * weight
     invented = _normalised(layers.get("invented")) * invented_weight

@@ -62,13 +62,13 @@ class LightTransfer:
             return self.light.falloff(distance, axis_cosine, facing_cosine)
         return (distance / self.scale_mm) ** -self.exponent
 
-    def invert_response(self, rgb: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-        """Image values in [0, 1] with the camera's response undone."""
-        return rgb if self.light is None else self.light.invert_response(rgb)
+    def invert_response(self, rgb: Float[Tensor, "*b"], channel_axis: int = -1) -> Float[Tensor, "*b"]:
+        """What surfaces sent: image values in [0, 1] with the camera's response and the glare undone."""
+        return rgb if self.light is None else self.light.invert_response(rgb, channel_axis)
 
-    def apply_response(self, signal: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-        """The image values of a signal."""
-        return signal if self.light is None else self.light.apply_response(signal)
+    def apply_response(self, signal: Float[Tensor, "*b"], channel_axis: int = -1) -> Float[Tensor, "*b"]:
+        """The image values of what surfaces send."""
+        return signal if self.light is None else self.light.apply_response(signal, channel_axis)
 
 
 @dataclass(frozen=True)

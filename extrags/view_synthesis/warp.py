@@ -226,7 +226,7 @@ def _relit(
     )
     ratio = own / theirs * (gain / references.exposure[chosen])[:, None]
     ratio = ratio.clamp(1 / BRIGHTNESS_LIMIT, BRIGHTNESS_LIMIT)
-    rgb = transfer.apply_response(transfer.invert_response(seen.rgb) * ratio[:, None])
+    rgb = transfer.apply_response(transfer.invert_response(seen.rgb, 1) * ratio[:, None], 1)
     # Too bright for the sensor: darkened as a whole, so that the hue stays.
     return rgb / rgb.amax(dim=1, keepdim=True).clamp_min(1)
 

@@ -22,7 +22,8 @@ import numpy as np
 LIGHT = (1, 1, 1, 0.1, 1, 1, 0.5, 0, 0, 0, 0.2)
 """Exposure, softening, exponent, spread, cosine, offset and shoulder."""
 HIGHLIGHTS = (0.2, 0.15)
-"""Strength and roughness, which builds of before there were highlights do not take."""
+GLARE = (0.1, 0.05, 0.07)
+"""Strength and roughness of highlights, and glare, which builds of before there were any do not take."""
 REFERENCE_DISTANCE = 1
 
 
@@ -53,9 +54,8 @@ def serve(root: Path, width: int, height: int, n_gaussians: int, threads: int, g
     target = Target(scene["viewmats"][0].numpy(), scene["Ks"][0].numpy(), scene["target"][0])
     step = DirectStep(lit=True)
     step.bind(parameters)
-    row = [*LIGHT, *HIGHLIGHTS, REFERENCE_DISTANCE]
-    if len(step.light_gradient) < len(row):
-        row = [*LIGHT, REFERENCE_DISTANCE]
+    row = [*LIGHT, *HIGHLIGHTS, *GLARE]
+    row = [*row[: len(step.light_gradient) - 1], REFERENCE_DISTANCE]
     light = np.array(row, dtype=np.float32)
     for index, _ in enumerate(sys.stdin):
         wall, processor = time.perf_counter(), time.process_time()

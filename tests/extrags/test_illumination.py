@@ -48,17 +48,19 @@ class TestNearFieldLight:
         assert bool((light().falloff(distance).diff() < 0).all())
 
     def test_switched_off_parts_start_without_effect(self) -> None:
-        off = {"falloff": False, "spread": False, "cosine": False, "response": False, "specular": False}
-        dark = NearFieldLight.initial(2, 25.0, LightConfig(**off))
+        off = ("falloff", "spread", "cosine", "response", "specular", "glare")
+        dark = NearFieldLight.initial(2, 25.0, LightConfig(**dict.fromkeys(off, False)))
         points = torch.tensor([[0.0, 0.0, 3.0], [30.0, 5.0, 40.0]])
         normals = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.6, 0.8]])
         torch.testing.assert_close(dark.gain(points, normals), torch.ones(2))
         assert torch.equal(dark.apply_response(points), points)
         assert torch.equal(dark.specular_gain(points, normals), torch.zeros(2))
 
-    @pytest.mark.parametrize("missing", ["log_specular", "spread"])
-    def test_of_what_is_stored_only_highlights_may_be_missing(self, missing: str, tmp_path: Path) -> None:
-        """Lights of before there were highlights have none."""
+    @pytest.mark.parametrize("missing", ["log_specular", "log_glare", "spread"])
+    def test_of_what_is_stored_only_what_came_later_may_be_missing(
+        self, missing: str, tmp_path: Path
+    ) -> None:
+        """Lights of before there were highlights, or glare, have none."""
         with new_group(tmp_path / "light") as group:
             for name, value in NearFieldLight.initial(2, 25.0).parameters().items():
                 if name not in (missing, "log_roughness"):
@@ -68,7 +70,8 @@ class TestNearFieldLight:
             with pytest.raises(DamagedArtefactError, match="spread"):
                 NearFieldLight.load(tmp_path / "light")
         else:
-            assert float(NearFieldLight.load(tmp_path / "light").log_specular) == -torch.inf
+            loaded = NearFieldLight.load(tmp_path / "light").parameters()[missing]
+            assert bool((loaded == -torch.inf).all())
 
     def test_albedo_is_what_the_light_and_the_response_leave(self) -> None:
         start = NearFieldLight.initial(1, 25.0)
@@ -79,6 +82,22 @@ class TestNearFieldLight:
         assert float(highlights.max()) > 1e-3
         seen = start.apply_response(albedo * start.gain(points, normals)[:, None] + highlights[:, None])
         torch.testing.assert_close(start.albedo(seen, points, normals), albedo)
+
+    @pytest.mark.parametrize("axis", [-1, 1])
+    def test_glare_lies_over_the_image_and_is_taken_away(self, axis: int) -> None:
+        veiled = replace(
+            NearFieldLight.initial(1, 25.0),
+            log_glare=torch.tensor([0.1, 0.03, 0.05], dtype=torch.float64).log(),
+        )
+        signal = torch.rand(2, 4, 3, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+        signal = signal.movedim(2, axis)
+        image = veiled.apply_response(signal, axis)
+        torch.testing.assert_close(veiled.invert_response(image, axis), signal)
+        black = veiled.apply_response(torch.zeros_like(signal), axis).movedim(axis, -1)
+        assert bool((black[..., 0] > black[..., 2]).all())
+        assert bool((black[..., 2] > black[..., 1]).all())
+        # What is darker than the glare sends nothing.
+        assert bool((veiled.invert_response(torch.zeros_like(signal), axis) == 0).all())
 
     def test_falloff_is_the_gain_of_surfaces_that_face_the_lens(self) -> None:
         start = NearFieldLight.initial(1, 25.0)

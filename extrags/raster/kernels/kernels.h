@@ -48,9 +48,10 @@ struct CameraLight {
   float offset[3];
   float shoulder;
   float specular, roughness;
+  float glare[3];
   float reference_distance;  // a gauge, not learned
 };
-constexpr int kLightLearned = 13, kLightRow = kLightLearned + 1;
+constexpr int kLightLearned = 16, kLightRow = kLightLearned + 1;
 static_assert(sizeof(CameraLight) == sizeof(float) * kLightRow, "the caller hands over a row of floats");
 constexpr int kPartials = 32;  // floats per chunk of Gaussians: 15 of the pose, those of the light from 16 on
 static_assert(16 + kLightLearned <= kPartials);

@@ -94,6 +94,8 @@ EXTRAGS_INLINE void develop(const View* view, const Lit& l, Vec* color) {
     Vec signal = color[channel] * (l.gain * Vec(light.exposure[channel]));
     if (shiny) signal = fma(l.lobe_gain, Vec(light.specular * light.exposure[channel]), signal);
     color[channel] = signal * Vec(1.f + light.shoulder) / fma(Vec(light.shoulder), signal, Vec(1.f));
+    const float glare = light.glare[channel];
+    if (glare != 0.f) color[channel] = sqrt(fma(color[channel], color[channel], Vec(glare * glare)));
   }
 }
 
@@ -110,8 +112,16 @@ static __attribute__((noinline)) void illuminate_backward(const View* view, cons
     const Vec lit = shiny ? fma(l.lobe_gain, Vec(light.specular), diffuse) : diffuse;
     const Vec signal = lit * Vec(light.exposure[channel]);
     const Vec inverse = one / fma(Vec(light.shoulder), signal, one), squared = inverse * inverse;
-    const Vec v_signal = v_color[channel] * Vec(1.f + light.shoulder) * squared;
-    v_light[10] = fma(v_color[channel] * squared, signal * (one - signal), v_light[10]);
+    Vec v_clear = v_color[channel];
+    const float glare = light.glare[channel];
+    if (glare != 0.f) {
+      const Vec clear = signal * Vec(1.f + light.shoulder) * inverse;
+      const Vec over = v_clear / sqrt(fma(clear, clear, Vec(glare * glare)));
+      v_light[13 + channel] = fma(over, Vec(glare), v_light[13 + channel]);
+      v_clear = over * clear;
+    }
+    const Vec v_signal = v_clear * Vec(1.f + light.shoulder) * squared;
+    v_light[10] = fma(v_clear * squared, signal * (one - signal), v_light[10]);
     v_light[channel] = fma(v_signal, lit, v_light[channel]);
     v_log = fma(v_signal, diffuse * Vec(light.exposure[channel]), v_log);
     if (shiny) v_lobe_gain = fma(v_signal, Vec(light.exposure[channel]), v_lobe_gain);

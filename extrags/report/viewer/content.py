@@ -226,8 +226,8 @@ def _header(
         row = scene.light.detached().camera_light(scene.light.exposure(None)[None]).packed()[0].tolist()
         names = ("softening", "exponent", "spread", "cosine")
         light = dict(zip(names, row[3:7], strict=True))
-        light |= dict(zip(("shoulder", "specular", "roughness", "reference"), row[10:], strict=True))
-        light["offset"] = row[7:10]
+        light |= dict(zip(("shoulder", "specular", "roughness"), row[10:13], strict=True))
+        light |= {"offset": row[7:10], "glare": row[13:16], "reference": row[16]}
     return {
         "name": name,
         "element": element,

@@ -36,7 +36,7 @@ from extrags.view_synthesis.references import LightTransfer
 
 __all__ = ["PretrainingScene", "ReferenceFrames", "make_pretraining_scene"]
 
-PRETRAINING_DATA_VERSION = 11
+PRETRAINING_DATA_VERSION = 12
 """Raised by hand whenever the same scene and settings give other pairs, or files hold something else."""
 REFERENCE_FRAMES = 24
 """Training frames at most that are kept with the pairs."""

@@ -14,7 +14,7 @@ from extrags.illumination import NearFieldLight
 from .tube import make_tube
 
 WIDTH, HEIGHT = 80, 64
-PLAIN = LightConfig(exponent=0.8, spread=False, cosine=False, response=False)
+PLAIN = LightConfig(exponent=0.8, spread=False, cosine=False, response=False, glare=False)
 CAMERA = Cameras(np.array([[[40.0, 0, 40], [0, 40.0, 32], [0, 0, 1]]]), np.eye(4)[None], WIDTH, HEIGHT)
 ROWS, COLUMNS = np.meshgrid(np.arange(HEIGHT), np.arange(WIDTH), indexing="ij")
 DISTANCE_PER_DEPTH = np.linalg.norm(pixel_rays(CAMERA)[0], axis=-1)
@@ -139,17 +139,19 @@ class TestDarkDirection:
             25.0,
             spread=torch.tensor(0.8),
             log_shoulder=torch.tensor(-0.4),
+            log_glare=torch.full((3,), 0.05).log(),
         )
         depth = np.random.default_rng(0).uniform(20, 60, (HEIGHT, WIDTH))
         distance, shoulder, softening = depth * DISTANCE_PER_DEPTH, np.exp(-0.4), np.exp(-1.5)
         gain = ((1 + softening) / ((distance / 25) ** 2 + softening)) ** 0.9 * DISTANCE_PER_DEPTH**-0.8
         signal = 0.6 * gain
-        image = (1 + shoulder) * signal / (1 + shoulder * signal)
+        image = np.hypot((1 + shoulder) * signal / (1 + shoulder * signal), 0.05)
         colour = np.array([1.3, 0.9, 1.1])
         colour /= colour @ [0.2126, 0.7152, 0.0722]
         # What is overexposed is as bright as an image can be.
         brighter, signal = image.copy(), signal.copy()
-        brighter[5, 7], signal[5, 7] = 1.7, 1.0
+        clear = np.sqrt(1 - 0.05**2)
+        brighter[5, 7], signal[5, 7] = 1.7, clear / (1 + shoulder * (1 - clear))
         lit = lit_luminance(CAMERA, brighter[..., None] * colour, depth, depth > 0, light) * gain / signal
         # The light's parameters are of single precision.
         np.testing.assert_allclose(lit, 1.0, rtol=20 * np.finfo(np.float32).eps)

@@ -27,6 +27,7 @@ LIGHT = CameraLight(
     1.0,
     torch.tensor(0.3),
     torch.tensor(0.4),
+    torch.tensor([0.1, 0.05, 0.07]),
 )
 
 

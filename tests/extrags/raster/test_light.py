@@ -16,6 +16,7 @@ from extrags.raster.light import (
     invert_response,
     light_gain,
     lit_colors,
+    remove_glare,
     shortest_axes,
     specular_gain,
 )
@@ -31,6 +32,7 @@ LEARNED = (
     "shoulder",
     "specular",
     "roughness",
+    "glare",
 )
 
 
@@ -48,6 +50,7 @@ def a_light(
         "shoulder": torch.tensor(0.8),
         "specular": torch.tensor(specular),
         "roughness": torch.tensor(0.3),
+        "glare": torch.tensor([0.08, 0.03, 0.05]),
     }
     leaves = {k: v.to(dtype).requires_grad_(gradients) for k, v in values.items()}
     return CameraLight(**leaves, reference_distance=1.7)
@@ -219,8 +222,21 @@ def test_highlights_are_the_distribution_of_ggx() -> None:
     expected = 0.4 * arriving * density / density[0]
     torch.testing.assert_close(specular_gain(points, normals, row), expected)
     black = torch.zeros(40, 3, dtype=torch.float64)
-    signal = invert_response(lit_colors(black, points, normals, row), row[10])
-    torch.testing.assert_close(signal, expected[:, None] * row[:3])
+    clear = remove_glare(lit_colors(black, points, normals, row), row[13:16])
+    torch.testing.assert_close(invert_response(clear, row[10]), expected[:, None] * row[:3])
+
+
+def test_glare_is_what_black_surfaces_show_whatever_the_exposure(isa: str) -> None:
+    scene = tube(64, 24, 20, seed=4, sh_degree=None).to(torch.float32)
+    light = a_light(1, torch.float32, specular=0.0)
+    black = replace(scene, colors=torch.zeros_like(scene.colors), background=torch.zeros(3))
+    for exposure in (0.5, 2.0):
+        brighter = replace(light, exposure=torch.full((1, 3), exposure))
+        rendering = black.render("native", light=brighter)
+        assert float(rendering.alpha.max()) > 0.5
+        torch.testing.assert_close(
+            rendering.rgb, rendering.alpha[..., None] * light.glare, atol=1e-6, rtol=1e-5
+        )
 
 
 @pytest.mark.parametrize(("roughness", "held"), [(1e-9, ROUGHNESS_MIN), (1.7, 1.0)])

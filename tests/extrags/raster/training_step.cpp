@@ -64,7 +64,7 @@ int main(int, char** given) {
   view.camera.cx = kWidth / 2.f;
   view.camera.cy = kHeight / 2.f;
   view.lit = true;
-  view.light = {{1.1f, 0.9f, 1.f}, 0.5f, 1.8f, 0.3f, 0.6f, {0.2f, -0.1f, 0.f}, 0.4f, 0.3f, 0.2f, 6.f};
+  view.light = {{1.1f, 0.9f, 1.f}, 0.5f, 1.8f, 0.3f, 0.6f, {0.2f, -0.1f, 0.f}, 0.4f, 0.3f, 0.2f, {0.03f, 0.01f, 0.02f}, 6.f};
 
   std::vector<float> rgb(3 * pixels), alpha(pixels), depth(pixels), median(pixels), means2d(2 * n), radius(n),
       most(n), sum(n);

@@ -72,17 +72,18 @@ class TestLight:
         vertex = PlyData.read(str(tmp_path / "a.ply"))["vertex"]
         assert torch.equal(torch.from_numpy(vertex["f_dc_1"].copy()), lit.gaussians.sh0[:, 0, 1])
 
-    @pytest.mark.parametrize("name", ["log_shoulder", "log_exponent", "log_specular"])
+    @pytest.mark.parametrize("name", ["log_shoulder", "log_exponent", "log_specular", "log_glare"])
     def test_what_is_zero_has_no_logarithm_that_json_can_say(
         self, name: str, lit: Scene, tmp_path: Path
     ) -> None:
-        """A linear response, a light without fall-off, a surface without highlights."""
+        """A linear response, a light without fall-off, a surface without highlights, a clean lens."""
         assert lit.light is not None
-        without = replace(lit.light, **{name: torch.tensor(-torch.inf)})
+        none = torch.full_like(lit.light.parameters()[name], -torch.inf)
+        without = replace(lit.light, **{name: none})
         write_ply_scene(Scene(lit.gaussians, without), tmp_path / "a.ply")
         back = read_ply_scene(tmp_path / "a.ply")
         assert back.light is not None
-        assert float(back.light.parameters()[name]) == -torch.inf
+        assert torch.equal(back.light.parameters()[name], none)
 
     def test_the_logarithm_of_the_exponent_in_files_of_before_is_read(
         self, lit: Scene, tmp_path: Path
@@ -102,13 +103,24 @@ class TestLight:
         assert float(back.log_specular) == pytest.approx(-1.5, rel=1e-6)
         assert float(back.log_roughness) == -2.0
 
-    def test_files_of_before_there_were_highlights_have_none(self, lit: Scene, tmp_path: Path) -> None:
+    def test_glare(self, lit: Scene, tmp_path: Path) -> None:
+        assert lit.light is not None
+        glare = torch.tensor([-2.5, -3.0, -torch.inf])
+        write_ply_scene(Scene(lit.gaussians, replace(lit.light, log_glare=glare)), tmp_path / "a.ply")
+        back = read_ply_scene(tmp_path / "a.ply").light
+        assert back is not None
+        torch.testing.assert_close(back.log_glare, glare)
+
+    def test_files_of_before_there_were_highlights_or_glare_have_none(
+        self, lit: Scene, tmp_path: Path
+    ) -> None:
         write_ply_scene(lit, tmp_path / "a.ply")
-        changed(tmp_path / "a.ply", specular=None, log_roughness=None)
+        changed(tmp_path / "a.ply", specular=None, log_roughness=None, glare=None)
         assert b"specular" not in (tmp_path / "a.ply").read_bytes()
         back = read_ply_scene(tmp_path / "a.ply").light
         assert back is not None
         assert float(back.log_specular) == -torch.inf
+        assert bool((back.log_glare == -torch.inf).all())
 
     def test_without_light_the_header_says_nothing(self, lit: Scene, tmp_path: Path) -> None:
         write_ply_scene(Scene(lit.gaussians), tmp_path / "a.ply")
@@ -126,6 +138,8 @@ class TestLight:
             ("colour", 1.0, "extrags_light"),
             ("specular", float("inf"), "extrags_light.specular"),
             ("specular", -0.1, "extrags_light.specular"),
+            ("glare", 0.1, "extrags_light.glare"),
+            ("glare", [0.1, 0.0, -0.1], "extrags_light.glare"),
         ],
     )
     def test_a_wrong_light_is_refused(

@@ -438,7 +438,7 @@ class TestHoleGaussians:
         light = tube_light()
         new = hole_gaussians(wall_scene(light), blind, views, self.ROOM)
         assert new is not None
-        signal = light.invert_response(torch.tensor(0.02, dtype=torch.float64))
+        signal = light.invert_response(torch.full((3,), 0.02, dtype=torch.float64))
         albedo = 0.28209479177387814 * new.sh0[:, 0].double() + 0.5
         # Colours are kept about one half, so the rounding is that of numbers as large.
         tolerance = 4 * torch.finfo(torch.float32).eps

@@ -9,7 +9,15 @@ import torch
 
 from extrags.config import LightConfig
 from extrags.illumination import NearFieldLight
-from extrags.training.light_fit import COMMON, LOG_ROUGHNESS_BOUNDS, DenseAdam, LightFit, lamp_distance
+from extrags.raster.light import ROW_LENGTH
+from extrags.training.light_fit import (
+    COMMON,
+    LOG_ROUGHNESS_BOUNDS,
+    DenseAdam,
+    LightFit,
+    drop_faint_glare,
+    lamp_distance,
+)
 
 EVERYTHING = LightConfig(offset=True)
 
@@ -23,7 +31,7 @@ def _light() -> NearFieldLight:
 
 
 def _gradient() -> np.ndarray:
-    return np.random.default_rng(4).normal(size=14).astype(np.float32)
+    return np.random.default_rng(4).normal(size=ROW_LENGTH).astype(np.float32)
 
 
 @pytest.mark.parametrize("frame", [None, 0, 3])
@@ -47,6 +55,7 @@ def test_gradients_are_those_of_autograd() -> None:
     expected = torch.cat([value.reshape(-1) for value in found if value is not None]).numpy()
     # The lamp does not leave the plane of the lens.
     expected[COMMON.index("offset") + 2] = 0
+    assert np.all(expected[-3:] != 0)
     np.testing.assert_allclose(fit.common_gradient(gradient), expected, rtol=1e-5)
     exposure = values["log_exposure"].grad
     assert exposure is not None
@@ -54,7 +63,9 @@ def test_gradients_are_those_of_autograd() -> None:
 
 
 def test_what_is_not_learned_stays() -> None:
-    config = LightConfig(falloff=False, response=False, specular=False, exposure=False, offset=False)
+    config = LightConfig(
+        falloff=False, response=False, specular=False, exposure=False, offset=False, glare=False
+    )
     light = NearFieldLight.initial(4, 10.0, config)
     fit = LightFit(light, config)
     for _ in range(3):
@@ -70,7 +81,7 @@ def test_the_lamp_moves_beside_the_lens_at_a_rate_of_its_own() -> None:
     config = LightConfig(offset_learning_rate=0.002)
     fit = LightFit(NearFieldLight.initial(2, 10.0, config), config)
     fit.row(0)
-    fit.step(np.where(np.arange(14) == 8, -1, 1).astype(np.float32))
+    fit.step(np.where(np.arange(ROW_LENGTH) == 8, -1, 1).astype(np.float32))
     np.testing.assert_allclose(fit.light.offset, [-0.002, 0.002, 0], rtol=1e-5)
     assert float(lamp_distance(fit.light.offset)) == pytest.approx(
         math.hypot(0.002, 0.002, 0.003) - 0.003, rel=1e-3
@@ -83,13 +94,27 @@ def test_a_lamp_that_nothing_holds_beside_the_lens_comes_back() -> None:
     start = fit.light.offset[:2].clone()
     for _ in range(300):
         fit.row(0)
-        fit.step(np.zeros(14, dtype=np.float32))
+        fit.step(np.zeros(ROW_LENGTH, dtype=np.float32))
     assert float(start.norm()) > 0.05
     assert float(fit.light.offset[:2].norm()) < 0.005
     free = LightFit(_light(), LightConfig(offset_prior=0))
     free.row(0)
-    free.step(np.zeros(14, dtype=np.float32))
+    free.step(np.zeros(ROW_LENGTH, dtype=np.float32))
     assert torch.equal(free.light.offset[:2], start)
+
+
+@pytest.mark.parametrize(("glare", "kept"), [((0.09, 0.06, 0.06), True), ((0.07, 0.05, 0.05), False)])
+def test_faint_glare_is_dropped_for_good(glare: tuple[float, ...], kept: bool) -> None:
+    fit = LightFit(replace(_light(), log_glare=torch.tensor(glare).log()), LightConfig(glare_kept_from=0.06))
+    fit.row(0)
+    fit.step(_gradient())
+    drop_faint_glare(fit.light, LightConfig(glare_kept_from=0.06))
+    assert bool(fit.light.log_glare.isfinite().all()) is kept
+    row = fit.row(0)
+    fit.step(_gradient())
+    assert bool((row[13:16] > 0).all()) is kept
+    assert bool(np.isfinite(row).all())
+    assert bool(fit.light.log_glare.isfinite().all()) is kept
 
 
 def test_a_virtual_view_teaches_no_exposure() -> None:
@@ -139,5 +164,5 @@ def test_a_roughness_does_not_leave_its_bounds() -> None:
         fit = LightFit(_light(), LightConfig(specular_learning_rate=0.5))
         for _ in range(20):
             fit.row(0)
-            fit.step(np.full(14, slope, dtype=np.float32))
+            fit.step(np.full(ROW_LENGTH, slope, dtype=np.float32))
         assert float(fit.light.log_roughness) == pytest.approx(bound)

@@ -120,6 +120,7 @@ class Renderer {
     gl.uniform3fv(places.home, light.home);
     gl.uniform1f(places.shoulder, light.shoulder);
     gl.uniform2f(places.gloss, light.specular, light.roughness);
+    gl.uniform3fv(places.glare, light.glare);
     gl.uniform1i(places.shade, state.shade);
     gl.bindVertexArray(this.splatArray);
     if (this.count) gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.count);

@@ -22,6 +22,7 @@ uniform vec4 place;           // offset of the lamp, reference distance
 uniform vec3 home;            // offset that the scene was made with, from the camera that looks
 uniform float shoulder;
 uniform vec2 gloss;           // strength and roughness of the specular lobe
+uniform vec3 glare;           // that lens and tube scatter over the image, as black shows it
 uniform int shade;            // 0 colour, 1 and more: a quantity
 out vec2 offset;
 flat out vec3 conic;
@@ -88,7 +89,8 @@ vec3 under_light(vec3 a, vec3 mean, vec3 normal) {
   float lobe = rough / (rough + (1.0 - rough) * missed);
   float shine = gloss.x * lobe * lobe * exp2(clamp(arriving, -40.0, 40.0));
   vec3 signal = exposure * (a * gain + shine);
-  return (1.0 + shoulder) * signal / (1.0 + shoulder * signal);
+  vec3 clear = (1.0 + shoulder) * signal / (1.0 + shoulder * signal);
+  return sqrt(clear * clear + glare * glare);
 }
 
 vec3 ramp(float t) {

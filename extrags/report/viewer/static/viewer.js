@@ -62,7 +62,7 @@ class Viewer {
     const exposures = this.camera ? this.data.groups[this.camera.group].cameras[this.camera.index].exposure : null;
     const exposure = (exposures && exposures[this.name]) || 1;
     return light ? { ...light, home: light.offset, on: true, exposure }
-      : { on: false, exposure: 1, softening: 1, exponent: 0, spread: 0, cosine: 0, offset: [0, 0, 0], home: [0, 0, 0], shoulder: 0, specular: 0, roughness: 1, reference: 1 };
+      : { on: false, exposure: 1, softening: 1, exponent: 0, spread: 0, cosine: 0, offset: [0, 0, 0], home: [0, 0, 0], shoulder: 0, specular: 0, roughness: 1, glare: [0, 0, 0], reference: 1 };
   }
 
   resetLight() {

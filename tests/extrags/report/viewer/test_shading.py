@@ -16,6 +16,7 @@ from extrags.report.viewer.content import script_text
 EXPOSURE, SHOULDER, REFERENCE = 1.3, 0.7, 12.0
 FALLOFF = {"softening": 0.3, "exponent": 1.1, "spread": 0.8, "cosine": 0.6}
 GLOSS = {"specular": 0.5, "roughness": 0.2}
+GLARE = (0.08, 0.02, 0.05)
 OWN = (0.15, -0.1, 0.05)
 UP = np.array([0.0, -1.0, 0.0])
 HERE = look_at(np.array([1.0, 2.0, -3.0]), np.array([2.0, 1.0, 15.0]), UP)
@@ -53,6 +54,7 @@ GLSL: dict[str, Any] = {
     "vec4": Vector,
     "mat3": lambda m: Matrix(np.asarray(m)[:3, :3]),
     "dot": lambda a, b: float(np.dot(a, b)),
+    "sqrt": np.sqrt,
     "inversesqrt": lambda x: x**-0.5,
     "log2": np.log2,
     "exp2": np.exp2,
@@ -86,6 +88,7 @@ def uniforms(
         "home": Vector(home),
         "shoulder": SHOULDER,
         "gloss": Vector(list(GLOSS.values())),
+        "glare": Vector(GLARE),
     }
 
 
@@ -106,6 +109,7 @@ def rendered(pose: np.ndarray, offset: tuple[float, ...], albedo: Any, mean: Any
     light = CameraLight(
         exposure=torch.full((1, 3), EXPOSURE),
         offset=torch.tensor(offset),
+        glare=torch.tensor(GLARE),
         reference_distance=REFERENCE,
         **values,
     )
@@ -120,7 +124,14 @@ def strength(given: dict[str, Any], mean: np.ndarray, normal: np.ndarray) -> flo
 
     def signal(roughness: float) -> float:
         gloss = Vector([GLOSS["specular"], roughness])
-        shown = float(under_light({**given, "gloss": gloss, "shoulder": 0.0}, np.zeros(3), mean, normal)[0])
+        shown = float(
+            under_light(
+                {**given, "gloss": gloss, "glare": Vector([0.0] * 3), "shoulder": 0.0},
+                np.zeros(3),
+                mean,
+                normal,
+            )[0]
+        )
         return shown
 
     # A roughness of one has its peak in all directions.
