@@ -67,7 +67,7 @@ class Pipeline(ABC):
             resting: list[str] = [
                 stage.name for stage in REGISTRY if stage.planned and stage.name not in self.leave_out
             ]
-            resting += ["coarse.refine_poses"] if config.coarse.refine_poses else []
+            resting += ["coarse.refine_poses"] if config.coarse.refine_poses is True else []
             if resting:
                 raise ConfigError(
                     "coarse.train_on is all: held-out frames are trained on, so nothing may rest on the "

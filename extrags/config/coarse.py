@@ -155,6 +155,28 @@ class PoseRefinementConfig(StageConfig):
         ge=0,
         description="weight of the mean squared correction, in degrees and hundredths of the depth",
     )
+    trial_share: float = Field(
+        0.4,
+        gt=0,
+        le=1,
+        description="refine_poses=auto: share of the iterations after which it is decided; poses whose "
+        "corrections are not kept are for the rest what they were",
+    )
+    kept_from_deg: float = Field(
+        0.45,
+        ge=0,
+        description="refine_poses=auto: mean correction from which on it is kept; turn and shift together, "
+        "the shift as the angle under which it is seen at the median depth",
+    )
+
+    @model_validator(mode="after")
+    def _trial_follows_start(self) -> Self:
+        if self.trial_share <= self.start_share:
+            raise ValueError(
+                f"trial_share is {self.trial_share:g}; poses are corrected from start_share, "
+                f"{self.start_share:g}, on"
+            )
+        return self
 
 
 class CoarseConfig(StageConfig):
@@ -228,9 +250,9 @@ class CoarseConfig(StageConfig):
     densify: DensifyConfig = DensifyConfig()
     light: LightConfig = LightConfig()
     refine_poses: bool | Literal["auto"] = Field(
-        False,
-        description="correct the poses of training frames as well; auto: where COLMAP estimated them. Pays "
-        "where poses are off by pixels; where they are good it costs held-out views a few tenths of a dB",
+        "auto",
+        description="correct the poses of training frames as well; auto: tried where depth was measured, "
+        "and kept where corrections are larger than good poses get (pose_refinement.kept_from_deg)",
     )
     pose_refinement: PoseRefinementConfig = PoseRefinementConfig()
     seed: Seed = Field(0, description="seed of all random sampling")

@@ -41,7 +41,8 @@ class TrainingResult:
         scene: without gradient history.
         history: every 50 iterations `{iteration, loss, psnr, n_gaussians}`; the PSNR is of the view just
             drawn, inside its weights.
-        refined: corrected poses of the training frames, where they were refined; the scene belongs to these.
+        refined: corrected poses of the training frames, where corrections were kept; the scene belongs to
+            these.
         frame_weights: which training frames are blurred or have moved, where that was looked for.
     """
 
@@ -103,9 +104,9 @@ def optimise(
             if not math.isfinite(observation.loss):
                 raise DivergedError(_account(schedule, iteration, adam.parameters, step.light), last_good)
             step.update(observation, iteration)
-            density.step(adam, observation.rendering, iteration)
             if iteration == schedule.glare_decided_at and step.light is not None:
                 drop_faint_glare(step.light, schedule.light)
+            density.step(adam, observation.rendering, iteration)
             last = iteration == schedule.iterations - 1
             if footprint is not None and (last or (iteration + 1) % APPLIED_EVERY == 0):
                 footprint.apply(adam.parameters)
@@ -126,7 +127,8 @@ def optimise(
         account = _account(schedule, schedule.iterations, adam.parameters, step.light)
         raise DivergedError(account, last_good)
     found = Scene(Gaussians(**adam.parameters), step.light).detached()
-    return TrainingResult(found, history, None if poses is None else poses.refined())
+    refined = poses.refined() if poses is not None and poses.kept else None
+    return TrainingResult(found, history, refined)
 
 
 def _psnr(observation: Observation, view: View) -> float:

@@ -77,11 +77,23 @@ class PoseRefinement:
         config: rates and prior.
         depth: median depth of the scene: the length a turn of one radian is compared with.
         iterations: of the whole optimisation.
+        tried: whether corrections that stay small are taken back (`PoseRefinementConfig.trial_share`).
     """
 
-    def __init__(self, cameras: Cameras, config: PoseRefinementConfig, depth: float, iterations: int) -> None:
+    def __init__(
+        self,
+        cameras: Cameras,
+        config: PoseRefinementConfig,
+        depth: float,
+        iterations: int,
+        *,
+        tried: bool = False,
+    ) -> None:
         self._config, self._depth, self._iterations = config, depth, iterations
         self._start = int(config.start_share * iterations)
+        # At the last iteration at the latest.
+        self._decided_at = min(math.ceil(config.trial_share * iterations), iterations - 1) if tried else None
+        self.kept = True
         self._given = cameras.world_from_camera.astype(np.float64)
         count = len(cameras)
         # Turns in radians and shifts in depths: one rate serves both.
@@ -91,8 +103,22 @@ class PoseRefinement:
         self._gauge = _gauge(cameras.centers / depth)
 
     def active(self, iteration: int) -> bool:
-        """Whether poses move at an iteration; before, the Gaussians settle on the given ones."""
-        return iteration >= self._start
+        """Whether poses move at an iteration.
+
+        Before some, the Gaussians settle on the given ones; after a trial that found little, they stay.
+        """
+        if iteration == self._decided_at and self.mean_correction_deg < self._config.kept_from_deg:
+            self.kept = False
+            self.corrections[:] = 0
+        return self.kept and iteration >= self._start
+
+    @property
+    def mean_correction_deg(self) -> float:
+        """Mean over the frames of turn and shift together, as the angle that the image shows.
+
+        A shift counts as the angle under which it is seen from the median depth.
+        """
+        return float(np.degrees(np.linalg.norm(self.corrections, axis=1)).mean())
 
     def viewmat(self, frame: int) -> Float[np.ndarray, "4 4"]:
         """Camera from world of a training frame as it stands now, float64."""

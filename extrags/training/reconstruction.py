@@ -108,8 +108,9 @@ def reconstruct(
         points = start.gaussians.means.numpy()
         schedule = replace(schedule, normals=NormalTerm.at(points, config, schedule.iterations))
     cameras, poses = sequence.cameras[chosen], None
-    if refines_poses(sequence, config):
-        poses = PoseRefinement(cameras, config.pose_refinement, depth, config.iterations)
+    tried = config.refine_poses == "auto"
+    if earlier is None and refines_poses(sequence, config):
+        poses = PoseRefinement(cameras, config.pose_refinement, depth, config.iterations, tried=tried)
     result = optimise(
         start.to(device),
         lambda _: views[next(order)],
@@ -122,6 +123,14 @@ def reconstruct(
             "%s: veiling glare; black shows as %s",
             sequence.name,
             " ".join(f"{value:.2f}" for value in light.log_glare.exp().tolist()),
+        )
+    if result.refined is not None and tried:
+        logger.warning(
+            "%s: the poses of training frames do not agree with their images; they are corrected by %.2g "
+            "degrees and %.2g units on average (coarse.refine_poses=auto)",
+            sequence.name,
+            result.refined.mean_turn_deg,
+            result.refined.mean_shift,
         )
     if config.one_sided:
         # Refined poses differ by far too little to change a side.
@@ -138,7 +147,7 @@ def _start(
 ) -> Scene:
     """What the optimisation starts from: new Gaussians and light, or an earlier scene."""
     if earlier is not None:
-        if refines_poses(sequence, config):
+        if config.refine_poses is True and refines_poses(sequence, config):
             raise ConfigError(
                 f"{sequence.name}: poses are refined (coarse.refine_poses); the earlier scene belongs to "
                 "others"
@@ -164,13 +173,18 @@ def smallest_footprint(config: CoarseConfig, cameras: Cameras) -> SmallestFootpr
 
 
 def refines_poses(sequence: EndoscopicSequence, config: CoarseConfig) -> bool:
-    """Whether `reconstruct` corrects poses: as the settings say; for `auto`, those that COLMAP estimated.
+    """Whether `reconstruct` corrects poses, as the settings say; for `auto`, whether it tries.
 
-    Poses are refined once: those that came out of a reconstruction are left as they are.
+    Poses are refined once: those that came out of a reconstruction are left as they are. Nor does `auto` try
+    where held-out frames are trained on, or where depth was not measured: to depth that is off, poses are
+    fitted as far as good ones are not.
     """
     if sequence.pose_source == "refined":
         return False
-    return sequence.pose_source == "estimated" if config.refine_poses == "auto" else config.refine_poses
+    if config.refine_poses != "auto":
+        return config.refine_poses
+    measured = sequence.depth_mm is not None and sequence.depth_error is None
+    return measured and config.train_on == "train"
 
 
 def coarse_schedule(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
     from flows.wiring import SequenceRun
 
 __all__ = ["ALONG", "export_scene", "posed_sequence"]
+
+logger = logging.getLogger(__name__)
 
 ALONG = ("training", "held-out", "virtual")
 """Cameras of a run to fly through; anything else that `--along` names is the file of a camera path."""
@@ -269,7 +272,8 @@ def _megabytes(*files: Path) -> str:
 def posed_sequence(given: argparse.Namespace) -> EndoscopicSequence:
     """The frames with the poses and intrinsics that the scene of a run with these settings is made with.
 
-    Where no stage changes those of the source, no run is needed.
+    Where no stage changes those of the source, no run is needed. Nor is it where the coarse stage only tries
+    to correct them (`coarse.refine_poses=auto`): without a run they are those of the source.
 
     Raises:
         StoreError: when a stage changes them and has not run.
@@ -283,5 +287,11 @@ def posed_sequence(given: argparse.Namespace) -> EndoscopicSequence:
     estimated = source.world_from_camera is None or config.poses.replace_given
     if not estimated and not refines_poses(source, config.coarse):
         return source
-    run = finished_run(given, "poses" if config.coarse.refine_poses is False else "coarse")
+    try:
+        run = finished_run(given, "poses" if config.coarse.refine_poses is False else "coarse")
+    except StoreError:
+        if estimated or config.coarse.refine_poses != "auto":
+            raise
+        logger.info("%s: poses are those of the source; no run may have corrected them", given.sequence)
+        return source
     return run.store.load(EndoscopicSequence, run.refs["sequence"])

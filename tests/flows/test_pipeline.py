@@ -247,7 +247,7 @@ class TestRules:
             extrags.run_pipeline(sequence, seen)
         with pytest.raises(ConfigError, match="and finetune would; the method oracle"):
             extrags.run_pipeline(sequence, seen, leave_out=METHODS["real-only"].leave_out)
-        refined = seen.with_overrides({"coarse.refine_poses": "auto"})
+        refined = seen.with_overrides({"coarse.refine_poses": True})
         with pytest.raises(ConfigError, match=r"and coarse\.refine_poses would"):
             extrags.run_pipeline(sequence, refined, leave_out=METHODS["oracle"].leave_out)
 

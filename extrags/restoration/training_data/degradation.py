@@ -98,6 +98,8 @@ class Degradation:
                 "sh_every": max(1, self.iterations // 4),
                 # Sides are for evaluation alone.
                 "one_sided": False,
+                # Poses that were spoilt on purpose stay so.
+                "refine_poses": False,
                 "max_points": round(self.gaussians_share * coarse.max_points),
                 "densify": coarse.densify.model_copy(update=densify),
                 "light": coarse.light.model_copy(update={"enabled": self.light}),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -177,10 +178,33 @@ def test_the_first_step_has_the_first_rate_and_the_last_the_last() -> None:
         (0.0, 100, 1e-3),
     ):
         config = PoseRefinementConfig(
-            prior=0.0, start_share=start_share, learning_rate=4e-3, learning_rate_final=1e-3
+            prior=0.0,
+            start_share=start_share,
+            learning_rate=4e-3,
+            learning_rate_final=1e-3,
+            trial_share=0.5,
         )
         poses = PoseRefinement(tube_cameras(), config, DEPTH_MM, 100)
         assert poses._rate(iteration) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(("turn_deg", "kept"), [(0.4, False), (0.5, True)])
+def test_corrections_that_stay_small_are_taken_back(turn_deg: float, kept: bool) -> None:
+    config = PoseRefinementConfig(start_share=0.1, trial_share=0.4, kept_from_deg=0.45)
+    tried = PoseRefinement(tube_cameras(), config, DEPTH_MM, 100, tried=True)
+    always = PoseRefinement(tube_cameras(), config, DEPTH_MM, 100)
+    for poses in (tried, always):
+        # Turn and shift count together.
+        poses.corrections[:, 1] = 0.6 * np.radians(turn_deg)
+        poses.corrections[:, 3] = 0.8 * np.radians(turn_deg)
+        assert poses.mean_correction_deg == pytest.approx(turn_deg)
+        assert [poses.active(iteration) for iteration in (9, 10, 39)] == [False, True, True]
+    assert [tried.active(iteration) for iteration in (40, 41, 99)] == [kept] * 3
+    assert tried.kept is kept
+    assert (tried.mean_correction_deg > 0) is kept
+    assert kept or np.allclose(tried.viewmat(2), tube_cameras().viewmats[2])
+    assert always.active(40)
+    assert always.mean_correction_deg > 0
 
 
 @pytest.fixture(scope="module")
@@ -197,12 +221,18 @@ def knocked_room(exact: EndoscopicSequence) -> EndoscopicSequence:
     return replace(exact, world_from_camera=poses, pose_source="estimated")
 
 
-def reconstruction(sequence: EndoscopicSequence, *, refine: bool) -> TrainingResult:
+def reconstruction(
+    sequence: EndoscopicSequence, *, refine: bool | Literal["auto"], iterations: int = 700
+) -> TrainingResult:
     settings = PoseRefinementConfig(learning_rate=2e-3, prior=0.0)
     return reconstruct(
         sequence,
         CoarseConfig(
-            iterations=700, max_points=1500, densify=QUIET, refine_poses=refine, pose_refinement=settings
+            iterations=iterations,
+            max_points=1500,
+            densify=QUIET,
+            refine_poses=refine,
+            pose_refinement=settings,
         ),
     )
 
@@ -244,6 +274,20 @@ def test_held_out_views_gain(
     assert refined.history[-1]["psnr"] > plain.history[-1]["psnr"] + 0.5
 
 
+def test_poses_are_corrected_where_that_is_called_for(
+    exact: EndoscopicSequence, knocked_room: EndoscopicSequence, caplog: pytest.LogCaptureFixture
+) -> None:
+    given = replace(knocked_room, pose_source="given")
+    found = reconstruction(given, refine="auto", iterations=300)
+    assert found.refined is not None
+    assert found.refined.mean_turn_deg > 0.3
+    assert "do not agree with their images" in caplog.text
+    caplog.clear()
+    left = reconstruction(exact, refine="auto", iterations=300)
+    assert left.refined is None
+    assert "do not agree" not in caplog.text
+
+
 def test_same_input_same_bits(knocked_room: EndoscopicSequence) -> None:
     config = CoarseConfig(iterations=40, max_points=300, refine_poses=True)
     first, second = (reconstruct(knocked_room, config).refined for _ in range(2))
@@ -255,13 +299,19 @@ def test_same_input_same_bits(knocked_room: EndoscopicSequence) -> None:
 
 def test_which_poses_are_refined(tube_sequence: EndoscopicSequence) -> None:
     estimated = replace(tube_sequence, pose_source="estimated")
+    assert tube_sequence.depth_mm is not None
+    guessed = replace(tube_sequence, depth_error=np.full_like(tube_sequence.depth_mm, 0.1))
     done = replace(tube_sequence, pose_source="refined")
     on, off = CoarseConfig(refine_poses=True), CoarseConfig(refine_poses=False)
     auto = CoarseConfig(refine_poses="auto")
-    assert not refines_poses(tube_sequence, auto)
+    assert auto == CoarseConfig()
+    assert refines_poses(tube_sequence, auto)
     assert refines_poses(estimated, auto)
-    assert not refines_poses(replace(tube_sequence, pose_source="aligned"), auto)
-    assert not refines_poses(estimated, CoarseConfig())
+    assert not refines_poses(done, auto)
+    assert not refines_poses(guessed, auto)
+    assert not refines_poses(replace(tube_sequence, depth_mm=None), auto)
+    assert not refines_poses(tube_sequence, CoarseConfig(train_on="all"))
+    assert refines_poses(guessed, on)
     assert refines_poses(tube_sequence, on)
     assert not refines_poses(estimated, off)
     assert not refines_poses(done, on)
