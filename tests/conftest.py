@@ -21,13 +21,36 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 check_arrays_alone()
 
+FLOWS = "tests/flows"
 PIPELINES = "tests/extrags/restoration/pretrained"
-SHARING = ("tests/flows", PIPELINES)
+SHARING = (FLOWS, PIPELINES)
 """Packages whose tests share a server and a finished run, or pipelines that are slow to import."""
+APART = frozenset(
+    f"{FLOWS}/test_{name}.py"
+    for name in (
+        "bench_enhance",
+        "bench_explore",
+        "cache_keys",
+        "cli_bench_kernels",
+        "cli_completion",
+        "continuation",
+        "data_commands",
+        "depth_stage",
+        "imports",
+        "memory_limit",
+        "pipeline_grid",
+        "pretrain",
+        "run_costs",
+    )
+)
+"""Files inside such a package that share none of it: without them the process of the flows, which would end
+last, has a quarter less to do."""
+SHARED_BY_FLOWS = frozenset({"prefect_server", "finished", "frames_read"})
+"""Fixtures that no test of `APART` may have: a second server costs more than is gained."""
 JOINING = {"tests/extrags/restoration/test_backends.py": PIPELINES}
 """Files beside a package that share what its tests share."""
 LONG = (
-    "tests/flows",
+    FLOWS,
     PIPELINES,
     "tests/extrags/poses/test_estimate.py",
     "tests/data_catalog/test_c3vd_scenes.py",
@@ -57,6 +80,8 @@ def pytest_configure(config: pytest.Config) -> None:
 def group_of(nodeid: str) -> str:
     """What one process runs: a file, whose fixtures are made once, or a package that shares dearer ones."""
     file = nodeid.partition("::")[0]
+    if file in APART:
+        return file
     found = next((package for package in SHARING if file.startswith(f"{package}/")), file)
     return JOINING.get(found, found)
 
@@ -99,6 +124,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         raise pytest.UsageError(
             f"the name of a test holds an address, so give its parameters ids: {named[0]}"
         )
+    for item in items:
+        if group_of(item.nodeid) in APART and SHARED_BY_FLOWS & {*getattr(item, "fixturenames", ())}:
+            raise pytest.UsageError(f"its file is one of `APART`, and it shares what flows do: {item.nodeid}")
     # Long groups first: one that begins last keeps the other processes waiting for it.
     rank = {group: place for place, group in enumerate(LONG)}
     items.sort(key=lambda item: rank.get(group_of(item.nodeid), len(rank)))

@@ -17,7 +17,6 @@ from prefect.settings import (
     PREFECT_SERVER_SERVICES_TRIGGERS_ENABLED,
     temporary_settings,
 )
-from prefect.testing.utilities import prefect_test_harness
 
 from extrags.cores import usable_cores
 from extrags.raster import native
@@ -49,6 +48,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="package")
 def prefect_server() -> Iterator[None]:
+    # With the server's modules, which only the process that starts one has to load.
+    from prefect.testing.utilities import prefect_test_harness
+
     with (
         temporary_settings(QUIET_SERVER),
         prefect_test_harness(server_startup_timeout=120),
