@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 import gc
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 from prefect.settings import (
@@ -18,6 +20,7 @@ from prefect.settings import (
     temporary_settings,
 )
 
+import flows.temporary_server
 from extrags.cores import usable_cores
 from extrags.raster import native
 from extrags.sequence import EndoscopicSequence
@@ -64,8 +67,15 @@ def prefect_server() -> Iterator[None]:
 
 @pytest.fixture(scope="package", autouse=True)
 def little_work() -> Iterator[None]:
-    """Runs of this package are about stages and their order, not about what a phantom looks like."""
-    with spared():
+    """Runs of this package are about stages and their order, not about what a phantom looks like.
+
+    Nor do commands start a server early: those that have one end it, and those that are refused leave it.
+    """
+
+    @functools.wraps(flows.temporary_server.start_early)
+    def not_early() -> None: ...
+
+    with spared(), patch.object(flows.temporary_server, "start_early", not_early):
         yield
 
 

@@ -25,6 +25,12 @@ from flows import temporary_server as server_module
 from flows.temporary_server import DATABASE, ServerError, copy_database, database_address, temporary_server
 
 
+@pytest.fixture(autouse=True)
+def early(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A server starts early as it does for users, and not in other tests of flows."""
+    monkeypatch.setattr(server_module, "start_early", server_module.start_early.__wrapped__)
+
+
 def made(path: Path, word: str = "whole") -> Path:
     with closing(sqlite3.connect(path)) as database, database:
         database.execute("PRAGMA journal_mode=WAL")
