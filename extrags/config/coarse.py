@@ -168,6 +168,9 @@ class PoseRefinementConfig(StageConfig):
         description="refine_poses=auto: mean correction from which on it is kept; turn and shift together, "
         "the shift as the angle under which it is seen at the median depth",
     )
+    kept_from_px: float = Field(
+        0.6, ge=0, description="refine_poses=auto: the same in pixels; both bounds have to be reached"
+    )
 
     @model_validator(mode="after")
     def _trial_follows_start(self) -> Self:

@@ -95,6 +95,7 @@ class PoseRefinement:
         self._decided_at = min(math.ceil(config.trial_share * iterations), iterations - 1) if tried else None
         self.kept = True
         self._given = cameras.world_from_camera.astype(np.float64)
+        self._focal_px = float(cameras.K[:, [0, 1], [0, 1]].mean())
         count = len(cameras)
         # Turns in radians and shifts in depths: one rate serves both.
         self.corrections = np.zeros((count, 6))
@@ -107,7 +108,7 @@ class PoseRefinement:
 
         Before some, the Gaussians settle on the given ones; after a trial that found little, they stay.
         """
-        if iteration == self._decided_at and self.mean_correction_deg < self._config.kept_from_deg:
+        if iteration == self._decided_at and self._small:
             self.kept = False
             self.corrections[:] = 0
         return self.kept and iteration >= self._start
@@ -119,6 +120,11 @@ class PoseRefinement:
         A shift counts as the angle under which it is seen from the median depth.
         """
         return float(np.degrees(np.linalg.norm(self.corrections, axis=1)).mean())
+
+    @property
+    def _small(self) -> bool:
+        found_px = math.radians(self.mean_correction_deg) * self._focal_px
+        return self.mean_correction_deg < self._config.kept_from_deg or found_px < self._config.kept_from_px
 
     def viewmat(self, frame: int) -> Float[np.ndarray, "4 4"]:
         """Camera from world of a training frame as it stands now, float64."""

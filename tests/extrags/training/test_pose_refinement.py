@@ -188,9 +188,12 @@ def test_the_first_step_has_the_first_rate_and_the_last_the_last() -> None:
         assert poses._rate(iteration) == pytest.approx(expected)
 
 
-@pytest.mark.parametrize(("turn_deg", "kept"), [(0.4, False), (0.5, True)])
-def test_corrections_that_stay_small_are_taken_back(turn_deg: float, kept: bool) -> None:
-    config = PoseRefinementConfig(start_share=0.1, trial_share=0.4, kept_from_deg=0.45)
+@pytest.mark.parametrize(
+    ("turn_deg", "least_px", "kept"), [(0.4, 0.1, False), (0.5, 0.2, True), (0.5, 0.22, False)]
+)
+def test_corrections_that_stay_small_are_taken_back(turn_deg: float, least_px: float, kept: bool) -> None:
+    """In degrees or in pixels, of which half a degree is 0.21 here."""
+    config = PoseRefinementConfig(start_share=0.1, trial_share=0.4, kept_from_deg=0.45, kept_from_px=least_px)
     tried = PoseRefinement(tube_cameras(), config, DEPTH_MM, 100, tried=True)
     always = PoseRefinement(tube_cameras(), config, DEPTH_MM, 100)
     for poses in (tried, always):
