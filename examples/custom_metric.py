@@ -35,8 +35,10 @@ CHROMA_ERROR = extrags.Metric(
 def evaluated(source: str, config: extrags.PipelineConfig) -> extrags.EvaluationResult:
     """Reconstruct a source and evaluate it, the registered metrics included."""
     sequence = extrags.read(source, config.ingest)
-    scene = extrags.reconstruct(sequence, config.coarse).scene
-    result = extrags.evaluate(scene, sequence)
+    found = extrags.reconstruct(sequence, config.coarse)
+    if found.refined is not None:  # poses that did not agree with the images were corrected
+        sequence = extrags.with_refined_poses(sequence, found.refined.world_from_camera)
+    result = extrags.evaluate(found.scene, sequence)
     for name in ("psnr", CHROMA_ERROR.key):
         observed = result.metrics["observed"][name]
         # Without geometry in the source nobody knows which surface was observed.

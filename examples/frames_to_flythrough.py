@@ -24,7 +24,10 @@ def reconstructed(source: str, config: extrags.PipelineConfig) -> tuple[extrags.
     if sequence.world_from_camera is None:
         estimate = extrags.estimate_poses(sequence, config.poses)
         sequence = extrags.with_estimated_poses(sequence, estimate)
-    return extrags.reconstruct(sequence, config.coarse).scene, sequence.training_cameras
+    found = extrags.reconstruct(sequence, config.coarse)
+    if found.refined is not None:  # poses that did not agree with the images were corrected
+        sequence = extrags.with_refined_poses(sequence, found.refined.world_from_camera)
+    return found.scene, sequence.training_cameras
 
 
 def flythrough(

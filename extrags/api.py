@@ -56,6 +56,7 @@ from extrags.sequence import EndoscopicSequence, Split
 from extrags.stages import STAGES
 from extrags.surface import Mesh, fuse_surface
 from extrags.training import TrainingResult, finetune, reconstruct
+from extrags.training.pose_refinement import with_refined_poses
 
 __all__ = [
     "PROFILES",
@@ -118,6 +119,7 @@ __all__ = [
     "sequence_from_arrays",
     "with_estimated_depth",
     "with_estimated_poses",
+    "with_refined_poses",
 ]
 
 _classes = {name: value for name, value in globals().items() if isclass(value)}

@@ -71,7 +71,7 @@ class EndoscopicSequence(Storable):
         truth: further ground truth of simulated sources, as JSON (light, exposure, ...).
         specular: true on specular highlights, [F, H, W]; they have no weight in training, but count in the
             evaluation of held-out frames like any other pixel. None where they were not detected.
-        pose_source: origin of the poses; the reconstruction may refine estimated ones.
+        pose_source: origin of the poses; the reconstruction may refine them.
         intrinsics: origin of `K`; the poses stage estimates what was guessed.
         focal_std_px: standard deviation of an estimated focal length, in pixels; None where it was not.
         withheld_depth_mm: true z-depth that the evaluation alone may use, 0 where unknown, [F, H, W]; None

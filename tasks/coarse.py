@@ -76,7 +76,7 @@ def save_reconstruction(slot: Slot, frames: EndoscopicSequence, result: Training
         slot.counts["refined_mean_turn_deg"] = result.refined.mean_turn_deg
 
 
-@stage("refined-frames", version=2)
+@stage("refined-frames", version=3)
 def refined_frames(slot: Slot, sequence: Ref, coarse: Ref) -> None:
     """The whole sequence with the refined poses of the coarse stage; writes `sequence/`."""
     from extrags.sequence import EndoscopicSequence

@@ -172,15 +172,6 @@ class PoseRefinementConfig(StageConfig):
         0.6, ge=0, description="refine_poses=auto: the same in pixels; both bounds have to be reached"
     )
 
-    @model_validator(mode="after")
-    def _trial_follows_start(self) -> Self:
-        if self.trial_share <= self.start_share:
-            raise ValueError(
-                f"trial_share is {self.trial_share:g}; poses are corrected from start_share, "
-                f"{self.start_share:g}, on"
-            )
-        return self
-
 
 class CoarseConfig(StageConfig):
     """Gaussians from the training views."""
@@ -259,6 +250,16 @@ class CoarseConfig(StageConfig):
     )
     pose_refinement: PoseRefinementConfig = PoseRefinementConfig()
     seed: Seed = Field(0, description="seed of all random sampling")
+
+    @model_validator(mode="after")
+    def _trial_follows_start(self) -> Self:
+        refinement = self.pose_refinement
+        if self.refine_poses == "auto" and refinement.trial_share <= refinement.start_share:
+            raise ValueError(
+                f"pose_refinement.trial_share is {refinement.trial_share:g}; with refine_poses=auto poses "
+                f"are corrected from start_share, {refinement.start_share:g}, on"
+            )
+        return self
 
     def starting_points(self, pixels: int) -> int:
         """How many points a reconstruction starts from at most.

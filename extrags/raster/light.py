@@ -212,14 +212,16 @@ def add_glare(image: Float[Tensor, "*b"], glare: Float[Tensor, "*c"]) -> Float[T
         image: not negative.
         glare: what black shows, broadcast to the image.
     """
-    squared = image.square() + glare.square()
+    none = glare.square() == 0
     # The root has no slope at zero.
-    return torch.where(glare == 0, image, torch.where(squared > 0, squared, 1).sqrt())
+    return torch.where(none, image, torch.where(none, 1, image.square() + glare.square()).sqrt())
 
 
 def remove_glare(image: Float[Tensor, "*b"], glare: Float[Tensor, "*c"]) -> Float[Tensor, "*b"]:
     """Inverse of `add_glare`; what is darker than the glare is black."""
-    return torch.where(glare == 0, image, (image.square() - glare.square()).clamp_min(0).sqrt())
+    squared = image.clamp_min(0).square() - glare.square()
+    left = torch.where(squared > 0, squared, 1).sqrt()
+    return torch.where(glare.square() == 0, image, torch.where(squared > 0, left, 0))
 
 
 def shortest_axes(quats: Float[Tensor, "n 4"], scales: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:

@@ -125,11 +125,12 @@ def _light(text: bytes, path: Path) -> NearFieldLight:
             field="extrags_light.reference_distance",
         )
     for name, value in strengths.items():
-        expected = "three numbers" if name in _COLORS else "a number"
-        fits = tuple(value.shape) == ((3,) if name in _COLORS else ())
-        if not (fits and bool((value.isfinite() & (value >= 0)).all())):
+        shape, most = ((3,), 1.0) if name in _COLORS else ((), math.inf)
+        fits = tuple(value.shape) == shape and bool((value.isfinite() & (value >= 0) & (value <= most)).all())
+        if not fits:
+            expected = "three numbers from 0 to 1" if name in _COLORS else "a number from 0 on"
             raise SourceError(
-                f"the light's {name} is {value.tolist()}, expected {expected} from 0 on",
+                f"the light's {name} is {str(value.tolist())[:80]}, expected {expected}",
                 file=path,
                 field=f"extrags_light.{name}",
             )

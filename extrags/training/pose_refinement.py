@@ -3,8 +3,8 @@
 A frame's rotation and centre are corrected apart: `R = exp(turn) R0`, `c = c0 + shift`, both in world axes.
 Corrections that translate, rotate or scale all frames together have no effect on the images, since the
 Gaussians follow; they are projected out after every step (the gauge), so the world frame stays fixed. Images
-of held-out frames are never used; `with_refined_poses` moves these frames with the training frames next to
-them, since they were registered in the same map and share its distortions.
+of held-out frames are never used; where poses were estimated, `with_refined_poses` moves these frames with
+the training frames next to them, since they were registered in the same map and share its distortions.
 """
 
 from __future__ import annotations
@@ -26,13 +26,15 @@ from extrags.store.storable import Storable
 from extrags.training.starting import median_depth
 from extrags.zarr_io import new_group, open_group, read_array, write_array
 
-__all__ = ["PoseRefinement", "RefinedPoses", "with_refined_poses"]
+__all__ = ["TRIAL_UPDATES", "PoseRefinement", "RefinedPoses", "with_refined_poses"]
 
 PRIOR_TURN_RAD = math.radians(1.0)
 PRIOR_SHIFT_SHARE = 0.01
 BETAS = (0.9, 0.99)
 """A frame is drawn once in an epoch: its own Adam must not remember longer than that lasts."""
 EPSILON = 1e-15
+TRIAL_UPDATES = 10
+"""Of each pose before it is decided: after fewer, corrections say more of their number than of the poses."""
 NEIGHBOURHOOD = 0.3
 """Range, in median depths or radians, within which training frames move a held-out frame with them."""
 
@@ -124,7 +126,10 @@ class PoseRefinement:
     @property
     def _small(self) -> bool:
         found_px = math.radians(self.mean_correction_deg) * self._focal_px
-        return self.mean_correction_deg < self._config.kept_from_deg or found_px < self._config.kept_from_px
+        # Not what is not a number either.
+        return not (
+            self.mean_correction_deg >= self._config.kept_from_deg and found_px >= self._config.kept_from_px
+        )
 
     def viewmat(self, frame: int) -> Float[np.ndarray, "4 4"]:
         """Camera from world of a training frame as it stands now, float64."""
@@ -194,10 +199,11 @@ class PoseRefinement:
 def with_refined_poses(
     sequence: EndoscopicSequence, refined: Float[np.ndarray, "m 4 4"]
 ) -> EndoscopicSequence:
-    """The sequence with refined poses of its training frames; held-out frames move with their neighbours.
+    """A sequence with the training poses that a reconstruction has corrected, to which its scene belongs.
 
-    The correction of a held-out frame is the mean of the training frames' corrections, weighted by how near
-    they are and how similar their directions are. Its image is not used.
+    Held-out poses that the source gave stay: all methods are evaluated at these. Where they were estimated,
+    the correction of one is the mean of the training frames' corrections, weighted by how near they are and
+    how similar their directions are. Its image is not used.
 
     Args:
         sequence: whose training frames, in order, were refined.
@@ -215,7 +221,7 @@ def with_refined_poses(
     turns = Rotation.from_matrix(refined[:, :3, :3] @ np.swapaxes(before[:, :3, :3], 1, 2)).as_rotvec()
     shifts = refined[:, :3, 3] - before[:, :3, 3]
     unit = median_depth(sequence, train)
-    for frame in sequence.test:
+    for frame in () if sequence.pose_source == "given" else sequence.test:
         apart = np.linalg.norm(before[:, :3, 3] - given[frame, :3, 3], axis=1) / unit
         angle = np.arccos(np.clip(before[:, :3, 2] @ given[frame, :3, 2], -1, 1))
         distance = apart**2 + angle**2

@@ -24,7 +24,7 @@ from extrags.training.footprint import SmallestFootprint
 from extrags.training.frame_weights import weighted_views
 from extrags.training.normal_term import NormalTerm
 from extrags.training.optimise import TrainingResult, optimise
-from extrags.training.pose_refinement import PoseRefinement
+from extrags.training.pose_refinement import TRIAL_UPDATES, PoseRefinement
 from extrags.training.schedule import Schedule
 from extrags.training.starting import median_depth, starting_gaussians, valid_pixels
 from extrags.training.views import epochs
@@ -63,8 +63,8 @@ def reconstruct(
         SourceError: when its arrays cannot be those of a recording (`extrags.sequence_checks.check_arrays`).
         CaptureError: with fewer than one frame, nothing to start from, or a unit of length too large for a
             scene without light.
-        ConfigError: for other settings than those of the coarse scene, and where poses are refined and there
-            is an earlier scene, which belongs to other poses.
+        ConfigError: for other settings than those of the coarse scene, and where poses shall be refined
+            (`refine_poses` is true) and there is an earlier scene, which belongs to other poses.
         ShapeError: for an earlier scene that does not fit (`extrags.training.continuing.continued_start`).
         DivergedError: when the optimisation does not stay finite.
 
@@ -176,15 +176,19 @@ def refines_poses(sequence: EndoscopicSequence, config: CoarseConfig) -> bool:
     """Whether `reconstruct` corrects poses, as the settings say; for `auto`, whether it tries.
 
     Poses are refined once: those that came out of a reconstruction are left as they are. Nor does `auto` try
-    where held-out frames are trained on, or where depth was not measured: to depth that is off, poses are
-    fitted as far as good ones are not.
+    where held-out frames are trained on; where depth was not measured, as to depth that is off, poses are
+    fitted as far as good ones are not; or where there are so many frames that each pose would be moved less
+    than `TRIAL_UPDATES` times before it is decided.
     """
     if sequence.pose_source == "refined":
         return False
     if config.refine_poses != "auto":
         return config.refine_poses
     measured = sequence.depth_mm is not None and sequence.depth_error is None
-    return measured and config.train_on == "train"
+    refinement = config.pose_refinement
+    iterations = (refinement.trial_share - refinement.start_share) * config.iterations
+    enough = iterations >= TRIAL_UPDATES * len(sequence.train)
+    return measured and enough and config.train_on == "train"
 
 
 def coarse_schedule(

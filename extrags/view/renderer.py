@@ -39,7 +39,7 @@ class ViewSettings:
         lamp: brightness of the lamp, 0 is off; 1 is that of the recording. It multiplies as the exposure
             does; a scene without a lamp has none to change.
         falloff: False lights everything as on the axis at the light's reference distance, facing the lamp,
-            without highlights: albedo under the camera's response.
+            without highlights and glare: albedo under the camera's response.
         layer: color; alpha, how opaque; depth, from near (red) to far (blue); uncertainty, how little the
             training views say (black: well known, yellow: unknown).
         mix: share of a layer other than colour, the rest of which is colour, 0 to 1.
@@ -229,6 +229,8 @@ class SceneRenderer:
                     log_specular=none,
                     log_glare=none.expand(3),
                 )
+            # What the lens scatters is the lamp's light.
+            light = replace(light, log_glare=light.log_glare + torch.tensor(settings.lamp).log())
             made = light.camera_light(torch.tensor([settings.exposure * settings.lamp]))
         moved = {
             name: value.to(self.device) for name, value in vars(made).items() if name != "reference_distance"

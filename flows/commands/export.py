@@ -57,7 +57,7 @@ def add_arguments(parser: Parser) -> None:
     parser.description = (
         "Write a finished run's scene as Gaussians, mesh, points or video, or a sequence with its poses, "
         "images, masks, depth and points for COLMAP or nerfstudio. Poses that the run estimates or refines "
-        "are taken from its store."
+        "are taken from its store; without a run, those of the source."
     )
     parser.set_defaults(command=export)
     add_sequence(parser)

@@ -285,13 +285,21 @@ def posed_sequence(given: argparse.Namespace) -> EndoscopicSequence:
     config = run_config(given)
     source = read(given.sequence, config.ingest)
     estimated = source.world_from_camera is None or config.poses.replace_given
-    if not estimated and not refines_poses(source, config.coarse):
+    made_elsewhere = config.imported.scene is not None or config.uc_nerf.enabled
+    refined = not made_elsewhere and refines_poses(source, config.coarse)
+    if not estimated and not refined:
         return source
     try:
-        run = finished_run(given, "poses" if config.coarse.refine_poses is False else "coarse")
+        run = finished_run(given, "coarse" if refined else "poses")
     except StoreError:
-        if estimated or config.coarse.refine_poses != "auto":
+        if not refined or config.coarse.refine_poses != "auto":
             raise
-        logger.info("%s: poses are those of the source; no run may have corrected them", given.sequence)
-        return source
+        if estimated:
+            run = finished_run(given, "poses")
+        else:
+            logger.warning(
+                "%s: no run with these settings is in the store; poses are those of the source, uncorrected",
+                given.sequence,
+            )
+            return source
     return run.store.load(EndoscopicSequence, run.refs["sequence"])

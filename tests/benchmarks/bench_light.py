@@ -44,8 +44,11 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "no cosine": {"light": {"cosine": False}},
     "no response": {"light": {"response": False}},
     "no highlights": {"light": {"specular": False}},
+    "no glare": {"light": {"glare": False}},
     "lamp in the lens": {"light": {"offset": False}},
-    "fall-off only": {"light": {"spread": False, "cosine": False, "response": False, "specular": False}},
+    "fall-off only": {
+        "light": {"spread": False, "cosine": False, "response": False, "specular": False, "glare": False}
+    },
     "no light": {"light": {"enabled": False}},
     "round start": {"thickness": 1.0},
     "no depth": {"depth_weight": 0.0},

@@ -94,8 +94,8 @@ EXTRAGS_INLINE void develop(const View* view, const Lit& l, Vec* color) {
     Vec signal = color[channel] * (l.gain * Vec(light.exposure[channel]));
     if (shiny) signal = fma(l.lobe_gain, Vec(light.specular * light.exposure[channel]), signal);
     color[channel] = signal * Vec(1.f + light.shoulder) / fma(Vec(light.shoulder), signal, Vec(1.f));
-    const float glare = light.glare[channel];
-    if (glare != 0.f) color[channel] = sqrt(fma(color[channel], color[channel], Vec(glare * glare)));
+    const float squared_glare = light.glare[channel] * light.glare[channel];
+    if (squared_glare > 0.f) color[channel] = sqrt(fma(color[channel], color[channel], Vec(squared_glare)));
   }
 }
 
@@ -113,11 +113,11 @@ static __attribute__((noinline)) void illuminate_backward(const View* view, cons
     const Vec signal = lit * Vec(light.exposure[channel]);
     const Vec inverse = one / fma(Vec(light.shoulder), signal, one), squared = inverse * inverse;
     Vec v_clear = v_color[channel];
-    const float glare = light.glare[channel];
-    if (glare != 0.f) {
+    const float squared_glare = light.glare[channel] * light.glare[channel];
+    if (squared_glare > 0.f) {
       const Vec clear = signal * Vec(1.f + light.shoulder) * inverse;
-      const Vec over = v_clear / sqrt(fma(clear, clear, Vec(glare * glare)));
-      v_light[13 + channel] = fma(over, Vec(glare), v_light[13 + channel]);
+      const Vec over = v_clear / sqrt(fma(clear, clear, Vec(squared_glare)));
+      v_light[13 + channel] = fma(over, Vec(light.glare[channel]), v_light[13 + channel]);
       v_clear = over * clear;
     }
     const Vec v_signal = v_clear * Vec(1.f + light.shoulder) * squared;

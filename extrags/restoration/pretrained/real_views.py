@@ -12,9 +12,11 @@ from torch import Tensor
 
 from extrags.errors import ShapeError
 from extrags.frame_stacks import frames_of, stacked
+from extrags.illumination import NearFieldLight
 from extrags.restoration.protocol import Clip
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
+from extrags.view_synthesis.references import LightTransfer
 from extrags.zarr_io import new_group, open_group, read_array, write_array, write_frames
 
 __all__ = ["RealViews"]
@@ -52,8 +54,7 @@ class RealViews:
         if clip.exposure is None:
             return frames
         transfer, gain = clip.transfer, float(np.mean(clip.exposure[chosen]))
-        signal = transfer.invert_response(torch.from_numpy(frames))
-        return np.asarray(transfer.apply_response(gain * signal).detach().clamp(0, 1).numpy())
+        return _brightened(torch.from_numpy(frames), transfer, gain)
 
     @classmethod
     def gather(cls, scene: Scene, sequence: EndoscopicSequence) -> RealViews:
@@ -76,9 +77,8 @@ class RealViews:
             )
 
         def at_mean_exposure(frame: int, gain: Tensor) -> UInt8[np.ndarray, "h w 3"]:
-            signal = light.invert_response(torch.from_numpy(sequence.rgb[frame].astype(np.float32) / 255))
-            balanced = light.apply_response(signal / gain).detach().clamp(0, 1).numpy()
-            return np.asarray(np.rint(balanced * 255).astype(np.uint8))
+            shown = torch.from_numpy(sequence.rgb[frame].astype(np.float32) / 255)
+            return np.asarray(np.rint(_brightened(shown, light, 1 / gain) * 255).astype(np.uint8))
 
         # One at a time: as floats, the frames of a long recording would not be in memory at once.
         gains = light.exposures().detach()
@@ -108,3 +108,12 @@ def _resized(frames: UInt8[np.ndarray, "n h w 3"], width: int, height: int) -> F
     for position, image in enumerate(images):
         smaller[position] = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
     return smaller
+
+
+def _brightened(
+    rgb: Float[Tensor, "*n h w 3"], transfer: LightTransfer | NearFieldLight, gain: float | Tensor
+) -> Float[np.ndarray, "*n h w 3"]:
+    """Colours at another exposure; those darker than the glare, such as a black border, stay."""
+    signal = transfer.invert_response(rgb)
+    shown = torch.where(signal > 0, transfer.apply_response(gain * signal), rgb)
+    return np.asarray(shown.detach().clamp(0, 1).numpy())

@@ -12,6 +12,7 @@ from extrags.errors import NonFiniteError
 from extrags.raster import CameraLight, set_num_threads
 from extrags.raster.light import (
     ROUGHNESS_MIN,
+    add_glare,
     apply_response,
     invert_response,
     light_gain,
@@ -166,6 +167,23 @@ def test_response_and_its_inverse() -> None:
     assert image[0] == 0
     assert torch.all(image.diff() > 0)
     torch.testing.assert_close(invert_response(image, shoulder), signal)
+
+
+@pytest.mark.parametrize("glare", [0.0, 1e-30, 0.1])
+def test_glare_and_its_inverse_have_finite_gradients(glare: float) -> None:
+    veil = torch.tensor(glare, requires_grad=True)
+    image = torch.tensor([0.0, 1e-20, 0.1, 0.3, 1.0], requires_grad=True)
+    shown = add_glare(image, veil)
+    clear = remove_glare(image, veil)
+    assert float(shown[0].detach()) == pytest.approx(glare)
+    # The bound of rounding grows where squares cancel.
+    torch.testing.assert_close(remove_glare(shown, veil), image, atol=1e-6, rtol=1e-5)
+    (shown.sum() + clear.sum()).backward()
+    assert image.grad is not None
+    assert veil.grad is not None
+    assert bool(image.grad.isfinite().all())
+    assert bool(veil.grad.isfinite())
+    assert bool((remove_glare(torch.tensor([-0.3, 0.5 * glare]), veil) <= 0.5e-30).all())
 
 
 def test_normals_are_the_shortest_axes() -> None:

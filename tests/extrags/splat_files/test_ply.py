@@ -140,6 +140,7 @@ class TestLight:
             ("specular", -0.1, "extrags_light.specular"),
             ("glare", 0.1, "extrags_light.glare"),
             ("glare", [0.1, 0.0, -0.1], "extrags_light.glare"),
+            ("glare", [0.1, 0.0, 1.5], "extrags_light.glare"),
         ],
     )
     def test_a_wrong_light_is_refused(

@@ -182,7 +182,6 @@ def test_the_first_step_has_the_first_rate_and_the_last_the_last() -> None:
             start_share=start_share,
             learning_rate=4e-3,
             learning_rate_final=1e-3,
-            trial_share=0.5,
         )
         poses = PoseRefinement(tube_cameras(), config, DEPTH_MM, 100)
         assert poses._rate(iteration) == pytest.approx(expected)
@@ -314,6 +313,8 @@ def test_which_poses_are_refined(tube_sequence: EndoscopicSequence) -> None:
     assert not refines_poses(guessed, auto)
     assert not refines_poses(replace(tube_sequence, depth_mm=None), auto)
     assert not refines_poses(tube_sequence, CoarseConfig(train_on="all"))
+    # Four frames, each of which is to be moved ten times in .35 of the iterations.
+    assert [refines_poses(tube_sequence, CoarseConfig(iterations=n)) for n in (114, 115)] == [False, True]
     assert refines_poses(guessed, on)
     assert refines_poses(tube_sequence, on)
     assert not refines_poses(estimated, off)
@@ -327,7 +328,7 @@ def test_held_out_frames_go_along(exact: EndoscopicSequence) -> None:
     bend = np.linspace(0, 1, len(exact))[:, None] ** 2 * np.array([0.0, 0.4, 0.0])
     refined = poses[train].copy()
     refined[:, :3, 3] += bend[train]
-    bent = with_refined_poses(exact, refined)
+    bent = with_refined_poses(replace(exact, pose_source="estimated"), refined)
     assert bent.pose_source == "refined"
     assert bent.world_from_camera is not None
     np.testing.assert_array_equal(bent.world_from_camera[train], refined)
@@ -336,6 +337,11 @@ def test_held_out_frames_go_along(exact: EndoscopicSequence) -> None:
     np.testing.assert_allclose(moved[0], bend[exact.test[0]], atol=0.04)
     assert bend[exact.train].max() > moved[1, 1] > 0.15
     np.testing.assert_allclose(bent.world_from_camera[:, :3, :3], poses[:, :3, :3], atol=1e-12)
+    # Held-out poses that the source gave are those of the evaluation.
+    given = with_refined_poses(exact, refined).world_from_camera
+    assert given is not None
+    np.testing.assert_array_equal(given[train], refined)
+    np.testing.assert_array_equal(given[exact.test], poses[exact.test])
     with pytest.raises(ShapeError, match="3 refined poses for 6 training frames"):
         with_refined_poses(exact, refined[:3])
 
@@ -345,7 +351,7 @@ def test_held_out_frames_go_along_with_what_looks_as_they_do(exact: EndoscopicSe
     assert exact.world_from_camera is not None
     poses = np.repeat(exact.world_from_camera[:1], len(exact), axis=0)
     poses[exact.train[1:], :3, :3] = poses[0, :3, :3] @ rotation_about(np.array([0.0, 1.0, 0.0]), np.pi / 2)
-    still = replace(exact, world_from_camera=poses)
+    still = replace(exact, world_from_camera=poses, pose_source="estimated")
     refined = poses[exact.train].copy()
     refined[0, :3, 3] += [0.0, 0.4, 0.0]
     found = with_refined_poses(still, refined).world_from_camera
