@@ -73,6 +73,9 @@ THREE_DGS_SHARED = frozenset(
         "pose_refinement.learning_rate",  # switched off
         "pose_refinement.learning_rate_final",
         "pose_refinement.prior",
+        "pose_refinement.trial_share",
+        "pose_refinement.kept_from_deg",
+        "pose_refinement.kept_from_px",
         "pose_refinement.start_share",
         "densify.opacity_penalty",
         "densify.scale_penalty",

@@ -184,7 +184,10 @@ def test_the_oracle_alone_trains_on_held_out_frames() -> None:
     with pytest.raises(ConfigError, match=r"variant seen: coarse\.train_on cannot be changed"):
         check_methods(["coarse"], {"seen": {"coarse.train_on": "all"}})
     oracle, ours = method_config("oracle", "balanced"), method_config("coarse", "balanced")
-    assert oracle.with_overrides({"coarse.train_on": "train"}) == ours
+    # Its poses stay those that it is evaluated at.
+    assert not oracle.coarse.refine_poses
+    same = oracle.with_overrides({"coarse.train_on": "train", "coarse.refine_poses": "auto"})
+    assert same == ours
 
 
 def test_tables_say_which_method_has_seen_held_out_frames() -> None:
