@@ -63,6 +63,7 @@ def test_scenes_in_the_page_are_those_of_the_run(html: str, drawn: ReportInputs)
         assert header["light"]["shoulder"] == pytest.approx(1)
         assert header["light"]["specular"] == pytest.approx(0.1)
         assert header["light"]["roughness"] == pytest.approx(0.2)
+        assert header["light"]["glare"] == pytest.approx([0.02] * 3)
 
 
 def test_cameras_have_the_exposures_of_the_evaluation(html: str, drawn: ReportInputs) -> None:
