@@ -185,10 +185,20 @@ def refines_poses(sequence: EndoscopicSequence, config: CoarseConfig) -> bool:
     if config.refine_poses != "auto":
         return config.refine_poses
     measured = sequence.depth_mm is not None and sequence.depth_error is None
+    if not measured or config.train_on != "train":
+        return False
     refinement = config.pose_refinement
     iterations = (refinement.trial_share - refinement.start_share) * config.iterations
-    enough = iterations >= TRIAL_UPDATES * len(sequence.train)
-    return measured and enough and config.train_on == "train"
+    if iterations >= TRIAL_UPDATES * len(sequence.train):
+        return True
+    logger.info(
+        "%s: poses are taken as they are: %d frames are too many for %d iterations to tell whether they are "
+        "off (coarse.refine_poses=auto)",
+        sequence.name,
+        len(sequence.train),
+        config.iterations,
+    )
+    return False
 
 
 def coarse_schedule(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 from typing import Literal
 
@@ -299,7 +300,7 @@ def test_same_input_same_bits(knocked_room: EndoscopicSequence) -> None:
     assert first.mean_turn_deg > 0
 
 
-def test_which_poses_are_refined(tube_sequence: EndoscopicSequence) -> None:
+def test_which_poses_are_refined(tube_sequence: EndoscopicSequence, caplog: pytest.LogCaptureFixture) -> None:
     estimated = replace(tube_sequence, pose_source="estimated")
     assert tube_sequence.depth_mm is not None
     guessed = replace(tube_sequence, depth_error=np.full_like(tube_sequence.depth_mm, 0.1))
@@ -314,7 +315,11 @@ def test_which_poses_are_refined(tube_sequence: EndoscopicSequence) -> None:
     assert not refines_poses(replace(tube_sequence, depth_mm=None), auto)
     assert not refines_poses(tube_sequence, CoarseConfig(train_on="all"))
     # Four frames, each of which is to be moved ten times in .35 of the iterations.
-    assert [refines_poses(tube_sequence, CoarseConfig(iterations=n)) for n in (114, 115)] == [False, True]
+    with caplog.at_level(logging.INFO, "extrags.training.reconstruction"):
+        assert refines_poses(tube_sequence, CoarseConfig(iterations=115))
+        assert not caplog.messages
+        assert not refines_poses(tube_sequence, CoarseConfig(iterations=114))
+    assert "4 frames are too many for 114 iterations" in caplog.text
     assert refines_poses(guessed, on)
     assert refines_poses(tube_sequence, on)
     assert not refines_poses(estimated, off)
