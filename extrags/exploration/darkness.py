@@ -54,6 +54,7 @@ def lit_luminance(
         with torch.no_grad():
             turned = camera.world_from_camera[0, :3, :3]
             falloff = light.gain(torch.from_numpy(points @ turned)).numpy()
+            # Of this luminance in each colour, whose glare differs.
             grey = torch.from_numpy(brightness).clamp(max=1.0)[..., None].expand(-1, -1, 3)
             brightness = luminance(light.invert_response(grey).numpy())
     else:

@@ -111,6 +111,14 @@ def reconstruct(
     tried = config.refine_poses == "auto"
     if earlier is None and refines_poses(sequence, config):
         poses = PoseRefinement(cameras, config.pose_refinement, depth, config.iterations, tried=tried)
+    elif tried and earlier is None and _poses_can_be_judged(sequence, config):
+        logger.info(
+            "%s: poses are taken as they are: %d frames are too many for %d iterations to tell whether they "
+            "are off (coarse.refine_poses=auto)",
+            sequence.name,
+            len(sequence.train),
+            config.iterations,
+        )
     result = optimise(
         start.to(device),
         lambda _: views[next(order)],
@@ -180,25 +188,17 @@ def refines_poses(sequence: EndoscopicSequence, config: CoarseConfig) -> bool:
     fitted as far as good ones are not; or where there are so many frames that each pose would be moved less
     than `TRIAL_UPDATES` times before it is decided.
     """
-    if sequence.pose_source == "refined":
-        return False
     if config.refine_poses != "auto":
-        return config.refine_poses
-    measured = sequence.depth_mm is not None and sequence.depth_error is None
-    if not measured or config.train_on != "train":
-        return False
+        return config.refine_poses and sequence.pose_source != "refined"
     refinement = config.pose_refinement
     iterations = (refinement.trial_share - refinement.start_share) * config.iterations
-    if iterations >= TRIAL_UPDATES * len(sequence.train):
-        return True
-    logger.info(
-        "%s: poses are taken as they are: %d frames are too many for %d iterations to tell whether they are "
-        "off (coarse.refine_poses=auto)",
-        sequence.name,
-        len(sequence.train),
-        config.iterations,
-    )
-    return False
+    return _poses_can_be_judged(sequence, config) and iterations >= TRIAL_UPDATES * len(sequence.train)
+
+
+def _poses_can_be_judged(sequence: EndoscopicSequence, config: CoarseConfig) -> bool:
+    """Whether corrections tell poses that are off, given enough iterations."""
+    measured = sequence.depth_mm is not None and sequence.depth_error is None
+    return measured and config.train_on == "train" and sequence.pose_source != "refined"
 
 
 def coarse_schedule(

@@ -291,15 +291,12 @@ def posed_sequence(given: argparse.Namespace) -> EndoscopicSequence:
         return source
     try:
         run = finished_run(given, "coarse" if refined else "poses")
-    except StoreError:
+    except StoreError as error:
         if not refined or config.coarse.refine_poses != "auto":
             raise
         if estimated:
             run = finished_run(given, "poses")
         else:
-            logger.warning(
-                "%s: no run with these settings is in the store; poses are those of the source, uncorrected",
-                given.sequence,
-            )
+            logger.warning("%s; poses are those of the source, which a run might correct", error)
             return source
     return run.store.load(EndoscopicSequence, run.refs["sequence"])

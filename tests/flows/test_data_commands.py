@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -41,9 +42,17 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 REFINING = {**TINY, "ingest.max_frames": 8, "coarse.refine_poses": True, "coarse.iterations": 60}
-REFINING_ARGUMENTS = ["--profile", "quick"]
-for name, value in REFINING.items():
-    REFINING_ARGUMENTS += ["--set", f"{name}={json.dumps(value)}"]
+# So many iterations that refine_poses=auto tries; nothing is run.
+TRYING = {**TINY, "ingest.max_frames": 8, "coarse.iterations": 1000}
+
+
+def arguments_of(settings: dict[str, Any]) -> list[str]:
+    return ["--profile", "quick"] + [
+        part for name, value in settings.items() for part in ("--set", f"{name}={json.dumps(value)}")
+    ]
+
+
+REFINING_ARGUMENTS, TRYING_ARGUMENTS = arguments_of(REFINING), arguments_of(TRYING)
 
 
 @pytest.fixture(scope="module")
@@ -227,6 +236,17 @@ class TestExport:
         arguments = ["export", str(folder), "--to", "colmap", "--out", str(tmp_path / "scene")]
         assert main([*arguments, "--store", str(tmp_path / "store")]) == 1
         assert "run it first" in capsys.readouterr().err
+
+    def test_poses_that_a_run_might_correct_are_those_of_the_source_without_one(
+        self, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        target = tmp_path / "scene"
+        trying = [*TRYING_ARGUMENTS, "--store", str(tmp_path / "store")]
+        assert main(["export", SEQUENCE, "--to", "transforms", "--out", str(target), *trying]) == 0
+        assert "poses are those of the source, which a run might correct" in caplog.text
+        given = read(SEQUENCE, method_config("extrags", "quick", TRYING).ingest)
+        found, expected = (np.sort(frames.cameras.centers[:, 2]) for frames in (read(target), given))
+        np.testing.assert_allclose(found, expected, atol=1e-9)
 
     @pytest.mark.parametrize("to", ["colmap", "transforms"])
     def test_poses_are_those_the_scene_was_made_with(

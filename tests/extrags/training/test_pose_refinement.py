@@ -300,7 +300,19 @@ def test_same_input_same_bits(knocked_room: EndoscopicSequence) -> None:
     assert first.mean_turn_deg > 0
 
 
-def test_which_poses_are_refined(tube_sequence: EndoscopicSequence, caplog: pytest.LogCaptureFixture) -> None:
+def test_too_many_frames_for_a_trial_are_told(
+    tube_sequence: EndoscopicSequence, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.INFO, "extrags.training.reconstruction"):
+        reconstruct(tube_sequence, CoarseConfig(iterations=5, max_points=100))
+    assert "4 frames are too many for 5 iterations" in caplog.text
+    caplog.clear()
+    with caplog.at_level(logging.INFO, "extrags.training.reconstruction"):
+        reconstruct(tube_sequence, CoarseConfig(iterations=5, max_points=100, refine_poses=False))
+    assert "too many" not in caplog.text
+
+
+def test_which_poses_are_refined(tube_sequence: EndoscopicSequence) -> None:
     estimated = replace(tube_sequence, pose_source="estimated")
     assert tube_sequence.depth_mm is not None
     guessed = replace(tube_sequence, depth_error=np.full_like(tube_sequence.depth_mm, 0.1))
@@ -315,11 +327,7 @@ def test_which_poses_are_refined(tube_sequence: EndoscopicSequence, caplog: pyte
     assert not refines_poses(replace(tube_sequence, depth_mm=None), auto)
     assert not refines_poses(tube_sequence, CoarseConfig(train_on="all"))
     # Four frames, each of which is to be moved ten times in .35 of the iterations.
-    with caplog.at_level(logging.INFO, "extrags.training.reconstruction"):
-        assert refines_poses(tube_sequence, CoarseConfig(iterations=115))
-        assert not caplog.messages
-        assert not refines_poses(tube_sequence, CoarseConfig(iterations=114))
-    assert "4 frames are too many for 114 iterations" in caplog.text
+    assert [refines_poses(tube_sequence, CoarseConfig(iterations=n)) for n in (114, 115)] == [False, True]
     assert refines_poses(guessed, on)
     assert refines_poses(tube_sequence, on)
     assert not refines_poses(estimated, off)
