@@ -31,6 +31,7 @@ from data_catalog.stereo import check_one_camera
 from extrags.arguments import check_settings_argument
 from extrags.config import DEFAULT_PROFILE, PROFILES, IngestConfig
 from extrags.errors import ConfigError, SourceError, SourceNotFoundError, UnknownSequenceError
+from extrags.measured_depth import with_depth_error
 from extrags.redaction import without_credentials
 from extrags.scarce_depth import without_scarce_depth
 from extrags.sequence import EndoscopicSequence
@@ -172,7 +173,7 @@ def read(source: Source | str | Path, config: IngestConfig | None = None) -> End
     if config.withhold_depth:
         sequence = sequence.without_training_depth()
     elif sequence.world_from_camera is not None:
-        sequence = without_scarce_depth(sequence)
+        sequence = with_depth_error(without_scarce_depth(sequence), config.depth_error)
     return with_specular(sequence)
 
 

@@ -9,7 +9,6 @@ what takes several frames. What is readable but questionable is reported by `dat
 
 from __future__ import annotations
 
-import logging
 from dataclasses import replace
 
 import numpy as np
@@ -33,7 +32,6 @@ __all__ = [
     "neighbouring_frames",
 ]
 
-logger = logging.getLogger(__name__)
 
 # Below this depth re-projection error (relative, median) poses are right. Another reading of the axes is
 # named as the likely mistake when its error is small, and a small share of the error as given. Where cameras
@@ -138,13 +136,13 @@ def check_axes(sequence: EndoscopicSequence, *, file: object = None, stored: Pos
 
 
 def check_depth_scale(sequence: EndoscopicSequence, *, file: object = None) -> None:
-    """Refuse depth in another unit than the poses, and tell of depth along the ray.
+    """Refuse depth in another unit than the poses, but not depth along the ray.
 
     Depth carried from frame to frame meets the next frame's depth only when both have one unit. Where it does
     not, but does so with all depth times one factor, that factor is named. Frames without parallax tell
     nothing, and where cameras move little any large factor fits as well as no motion: that is no unit.
-    Where it meets it at least four times better once it is divided by the length of each pixel's ray, a
-    warning says so.
+    Where it meets it at least four times better once it is divided by the length of each pixel's ray, it is
+    in the unit of the poses.
 
     Raises:
         SourceError: another factor, at least 1.5 times more or less, fits much better; or K is that of an
@@ -160,7 +158,7 @@ def check_depth_scale(sequence: EndoscopicSequence, *, file: object = None) -> N
     poses = np.asarray(sequence.world_from_camera, dtype=np.float64)
     seen = _seen_points(sequence, pairs)
     as_given = _reprojection_error(sequence, poses, pairs, seen)
-    if as_given > _RAY_SUSPICIOUS_ERROR and _is_along_ray(sequence, poses, pairs, file):
+    if as_given > _RAY_SUSPICIOUS_ERROR and _is_along_ray(sequence, poses, pairs):
         return
     if as_given < _SUSPICIOUS_ERROR:
         return
@@ -224,27 +222,14 @@ def _is_along_ray(
     sequence: EndoscopicSequence,
     poses: Float[np.ndarray, "f 4 4"],
     pairs: list[tuple[int, int]],
-    file: object,
 ) -> bool:
-    """Whether depth is the distance along the ray, as poses tell; a warning names the cure then."""
+    """Whether depth is the distance along the ray, as poses tell: `extrags.measured_depth` converts it."""
     readings = (_pair_errors(sequence, poses, pairs, along_ray=along) for along in (False, True))
     both = [(plain, along) for plain, along in zip(*readings, strict=True) if None not in (plain, along)]
     if len(both) <= len(pairs) / 2:
         return False
     plain, along = np.mean(np.array(both, dtype=np.float64), axis=0)
-    if plain <= _RAY_SUSPICIOUS_ERROR or along > _CLEARLY_ALONG_RAY * plain:
-        return False
-    logger.warning(
-        "%s: depth that the poses carry from frame to frame is off by %.1f %% (median), but only by %.1f %% "
-        "when it is read as the distance along each pixel's ray; expected z-depth, the distance along the "
-        "optical axis. Divide each value by the length of its pixel's ray, the root of "
-        "1 + ((u - cx) / fx)^2 + ((v - cy) / fy)^2",
-        sequence.name if file is None else file,
-        100 * plain,
-        100 * along,
-        extra={"topic": "depth and poses", "field": "depth_mm"},
-    )
-    return True
+    return bool(plain > _RAY_SUSPICIOUS_ERROR and along <= _CLEARLY_ALONG_RAY * plain)
 
 
 def _refuse_intrinsics_of_another_size(sequence: EndoscopicSequence, as_given: float, file: object) -> None:

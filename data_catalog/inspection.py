@@ -28,7 +28,7 @@ from extrags.sequence import EndoscopicSequence, saturated_mask
 
 __all__ = ["Finding", "Inspection", "contact_sheet", "facts", "inspect"]
 
-LOGGERS = ("data_catalog", "extrags.frame_names")
+LOGGERS = ("data_catalog", "extrags.frame_names", "extrags.measured_depth")
 """Of what looks at a source while it is read."""
 _TILE_WIDTH = 240
 _MAX_TILES = 30

@@ -153,8 +153,8 @@ class InMemoryPipeline(Pipeline):
         return self.result.sequence.world_from_camera is not None
 
     def has_depth(self) -> bool:
-        """Whether any training frame of the source has depth, in the unit of the poses."""
-        return self.result.sequence.training_depth_known
+        """Whether training frames have depth that is taken as it is, in the unit of the poses."""
+        return self.result.sequence.training_depth_known and self.result.sequence.depth_error is None
 
     def training_frame_count(self) -> int:
         """Number of training frames."""

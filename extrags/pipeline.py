@@ -141,7 +141,7 @@ class Pipeline(ABC):
 
     @abstractmethod
     def has_depth(self) -> bool:
-        """Whether any training frame of the source has depth, in the unit of the poses."""
+        """Whether training frames have depth that is taken as it is, in the unit of the poses."""
 
     @abstractmethod
     def training_frame_count(self) -> int:
@@ -236,7 +236,7 @@ def stages_that_can_run(
         config: settings of all stages.
         leave_out: stages that the method leaves out.
         has_poses: whether the source has camera poses.
-        has_depth: whether it has depth of training frames.
+        has_depth: whether training frames have depth that is taken as it is.
         train: number of training frames.
         test: number of held-out frames.
     """

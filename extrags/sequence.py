@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from extrags.array_shapes import check_array, check_instance
 from extrags.cameras import Cameras
 from extrags.errors import ShapeError
+from extrags.frame_quantiles import median_of_frames
 from extrags.frame_stacks import frames_of, stacked
 from extrags.lens import Undistortion, resized_depth
 from extrags.provenance import (
@@ -77,8 +78,8 @@ class EndoscopicSequence(Storable):
         withheld_depth_mm: true z-depth that the evaluation alone may use, 0 where unknown, [F, H, W]; None
             where `depth_mm` is the truth. See `true_depth_mm`.
         scale_source: what the unit of length rests on; of no account where it is arbitrary.
-        depth_error: expected relative error of an estimated `depth_mm`, [F, H, W]; None where the depth was
-            measured.
+        depth_error: expected relative error of `depth_mm`, [F, H, W], where it was estimated, or measured and
+            frames disagree about it (`extrags.measured_depth`); None where it is taken as it is.
         lens: of all frames, where they are the original pixels of a wide lens; None for pinholes.
         stereo_camera: whose frames these are, of a stereo endoscope; None of a source with one camera.
 
@@ -147,7 +148,7 @@ class EndoscopicSequence(Storable):
         if self.depth_mm is not None and not self.training_depth_known:
             depth = "depth for the evaluation alone"
         elif self.depth_error is not None:
-            depth = "estimated depth"
+            depth = "depth with an expected error"
         poses = "no poses" if self.world_from_camera is None else f"poses {self.pose_source}"
         return (
             f"EndoscopicSequence({self.name!r}, {len(self)} frames of {self.width} x {self.height} px, "
@@ -208,6 +209,15 @@ class EndoscopicSequence(Storable):
     def training_depth_known(self) -> bool:
         """Whether any training frame has depth: held-out frames may have some for the evaluation alone."""
         return self.depth_mm is not None and any(bool((self.depth_mm[k] > 0).any()) for k in self.train)
+
+    @cached_property
+    def median_depth_error(self) -> float:
+        """Expected relative error of the training frames' depth, in the median; 0 where it has none."""
+        if self.depth_error is None:
+            return 0.0
+        errors = self.depth_error
+        found = median_of_frames(lambda: (errors[frame][self.mask[frame]] for frame in self.train.tolist()))
+        return 0.0 if found is None else float(found)
 
     @cached_property
     def true_depth_mm(self) -> Float[np.ndarray, "f h w"] | None:

@@ -117,8 +117,9 @@ class SequenceRun(CachedStages):
         return bool(self._manifest("sequence").counts["has_poses"])
 
     def has_depth(self) -> bool:
-        """Whether any training frame of the source has depth, in the unit of the poses."""
-        return bool(self._manifest("sequence").counts["has_depth"])
+        """Whether training frames have depth that is taken as it is, in the unit of the poses."""
+        counts = self._manifest("sequence").counts
+        return bool(counts["has_depth"]) and not counts.get("depth_error")
 
     def training_frame_count(self) -> int:
         """Number of training frames."""

@@ -100,7 +100,8 @@ def frames_stages(
         config: settings of all stages.
         leave_out: stages that the method leaves out.
     """
-    has_poses, has_depth = (bool(counts.get(name)) for name in ("has_poses", "has_depth"))
+    has_poses = bool(counts.get("has_poses"))
+    has_depth = bool(counts.get("has_depth")) and not counts.get("depth_error")
     train, test = (float(counts[name] or 0) for name in ("train", "test"))
     return stages_that_can_run(
         config, leave_out, has_poses=has_poses, has_depth=has_depth, train=train, test=test

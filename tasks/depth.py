@@ -44,7 +44,7 @@ def keyed_settings(config: DepthConfig) -> DepthConfig:
 
 
 # The digests stand for the content of weights; the task finds them by the settings again.
-@stage("depth", version=7, ignore=("monocular", "completion"))
+@stage("depth", version=8, ignore=("monocular", "completion"))
 def depth(
     slot: Slot,
     sequence: Ref,

@@ -17,7 +17,7 @@ log = logging.getLogger(__name__)
 
 
 # The fingerprint covers the content of the files; their location is not part of the key.
-@stage("ingest", version=7, ignore=("source", "calibration"))
+@stage("ingest", version=8, ignore=("source", "calibration"))
 def ingest(
     slot: Slot,
     source: Source,
@@ -68,6 +68,7 @@ def ingest(
         intrinsics=sequence.intrinsics,
         scale=sequence.scale_words if sequence.world_from_camera is not None else "",
         has_depth=int(sequence.training_depth_known),
+        depth_error=sequence.median_depth_error,
         detail_width=detail.reduced_width,
         detail_height=detail.reduced_height,
         detail=str(detail),

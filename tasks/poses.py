@@ -17,15 +17,15 @@ def estimating_settings(config: PosesConfig) -> PosesConfig:
 
 
 def lens_settings(config: IngestConfig) -> IngestConfig:
-    """The settings of reading that say what becomes of frames whose lens the stage finds to be distorted."""
-    kept = ("lens", "field_of_view_deg", "size", "width", "downscale")
-    if config.lens == "pinhole" and config.field_of_view_deg is None:
+    """The settings of reading that say what becomes of depth, and of frames whose lens is found distorted."""
+    kept = ["depth_error"]
+    if config.lens != "pinhole" or config.field_of_view_deg is not None:
         # Sizes are those of a pinhole that is wider than the lens's centre.
-        return IngestConfig()
+        kept += ["lens", "field_of_view_deg", "size", "width", "downscale"]
     return IngestConfig(**{name: getattr(config, name) for name in kept})
 
 
-@stage("poses", version=13)
+@stage("poses", version=14)
 def poses(slot: Slot, sequence: Ref, config: PosesConfig, ingest: IngestConfig | None = None) -> None:
     """Estimate poses; writes `sequence/` without the frames that could not be registered, and `poses.json`.
 
@@ -61,6 +61,7 @@ def poses(slot: Slot, sequence: Ref, config: PosesConfig, ingest: IngestConfig |
         test=len(posed.test),
         dropped=len(unposed) - len(posed),
         has_depth=int(posed.training_depth_known),
+        depth_error=posed.median_depth_error,
         method=estimate.method,
         scale=posed.scale_words,
         summary=estimate.summary,

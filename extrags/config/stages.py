@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from operator import attrgetter
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, ValidationError, field_validator
 
@@ -84,6 +84,13 @@ class IngestConfig(StageConfig):
         False,
         description="training frames keep no depth; held-out frames keep theirs for the evaluation alone. "
         "Points of a source that has depth go with it",
+    )
+    depth_error: Annotated[float, Field(ge=0, le=0.5)] | Literal["auto"] = Field(
+        "auto",
+        description="relative error of depth that the source has. auto: none, unless training frames "
+        "disagree about their depth by more than poses that are off explain; a number: so much; 0: depth is "
+        "taken as it is. Depth with an error is corrected and combined with what the depth stage estimates. "
+        "auto also converts depth along the ray, or in another unit than the poses, where that is clear",
     )
     scale_mm_per_unit: float | None = Field(
         None,

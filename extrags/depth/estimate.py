@@ -15,9 +15,10 @@ from torch.nn import functional
 
 from extrags.config import DEFAULT_PROFILE, PROFILES, PosesConfig
 from extrags.config.depth import DepthConfig
+from extrags.depth.combination import CERTAIN, HOPELESS, Depth, combined
 from extrags.depth.completion import CompletionNetwork, completion_inputs
 from extrags.depth.edges import sharpened
-from extrags.depth.frames import PosedFrames, select_sources
+from extrags.depth.frames import PosedFrames
 from extrags.depth.monocular import MonocularPredictor, predictions
 from extrags.depth.monocular_network import load_monocular
 from extrags.depth.report import depth_report
@@ -40,6 +41,7 @@ from extrags.lens import distortion_of_pinhole
 from extrags.poses.triangulation import triangulate_points
 from extrags.radial_lens import WIDE_FIELD_DEG
 from extrags.sequence import EndoscopicSequence
+from extrags.source_frames import select_sources
 from extrags.store.storable import Storable
 from extrags.threads import in_threads, one_torch_thread
 from extrags.training.random_start import depth_range
@@ -51,9 +53,6 @@ _LOG = logging.getLogger(__name__)
 
 MIN_POINTS = 12
 """Fewer points in a view say nothing about the range of its depths."""
-
-CERTAIN, HOPELESS = 0.005, 1.0
-"""Bounds of the expected relative error."""
 
 STEREO_TRUST_SOURCES = 2.0
 """Sources that must agree with stereo for it to be taken where the network has another opinion."""
@@ -99,8 +98,10 @@ class DepthEstimate(Storable):
     @property
     def summary(self) -> str:
         """One line for plans and logs."""
+        measured = self.report.get("median_measured_error")
+        before = "" if measured is None else f" ({100 * measured:.1f} % as measured)"
         return (
-            f"expected error {100 * self.report['median_expected_error']:.1f} % in the median; "
+            f"expected error {100 * self.report['median_expected_error']:.1f} % in the median{before}; "
             f"{self.report['n_points']} points, {self.report['agreeing_share']:.0%} of pixels confirmed by "
             "other frames"
         )
@@ -137,7 +138,8 @@ def estimate_depth(
 
     Points give the range to search; stereo searches it, with the depth that brightness predicts, and a
     monocular network where there is one, as a weak prior; a network completes the result and says how wrong
-    it expects to be.
+    it expects to be. Measured depth with an expected error (`extrags.measured_depth`) is corrected by the
+    estimate and combined with it; without one it is not looked at.
 
     Args:
         sequence: with poses.
@@ -155,6 +157,10 @@ def estimate_depth(
         MissingDependencyError: when a monocular network is asked for without the package it needs.
     """
     config = PROFILES[DEFAULT_PROFILE].depth if config is None else config
+    if sequence.depth_mm is not None and sequence.depth_error is not None:
+        blind = replace(sequence, depth_mm=None, depth_error=None)
+        estimate = estimate_depth(blind, config, poses, monocular=monocular, stage=stage)
+        return _with_measured(estimate, sequence)
     if sequence.lens is not None:
         flat = sequence.as_pinhole(WIDE_FIELD_DEG)
         return _through_lens(
@@ -206,6 +212,30 @@ def estimate_depth(
         "median_expected_error": _median_error(expected, sequence.mask),
     }
     return DepthEstimate(depth, expected, points.astype(np.float64), points_rgb, report)
+
+
+def _with_measured(estimate: DepthEstimate, sequence: EndoscopicSequence) -> DepthEstimate:
+    """An estimate with what was measured, of all frames.
+
+    Args:
+        estimate: of all frames of the sequence.
+        sequence: its depth has an expected error.
+    """
+    assert sequence.depth_mm is not None
+    assert sequence.depth_error is not None
+    depth, expected = FrameStack(len(sequence)), FrameStack(len(sequence))
+    for index, mask in enumerate(sequence.mask):
+        measured = Depth(np.where(mask, sequence.depth_mm[index], 0), sequence.depth_error[index])
+        both = combined(Depth(estimate.depth[index], estimate.expected_error[index]), measured)
+        depth.append(both.z)
+        expected.append(both.error)
+    report = {
+        **estimate.report,
+        "combined_with_measured": True,
+        "median_measured_error": _median_error(sequence.depth_error, sequence.mask),
+        "median_expected_error": _median_error(expected.array, sequence.mask),
+    }
+    return replace(estimate, depth=depth.array, expected_error=expected.array, report=report)
 
 
 def _median_error(expected: Float[np.ndarray, "f h w"], mask: Bool[np.ndarray, "f h w"]) -> float:

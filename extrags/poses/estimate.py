@@ -13,6 +13,7 @@ from extrags.cameras import as_rotation
 from extrags.config import DEFAULT_PROFILE, PROFILES, IngestConfig, PosesConfig
 from extrags.errors import CaptureError, ConfigError, ShapeError
 from extrags.frame_stacks import frames_of, stacked
+from extrags.measured_depth import as_given, with_depth_error
 from extrags.poses.attempts import attempted, enough_registered
 from extrags.poses.calibration import with_calibration
 from extrags.poses.job import PoseJob, PoseJobResult, run_job
@@ -399,6 +400,7 @@ def with_estimated_poses(
         raise ShapeError(
             f"{sequence.name} has {len(sequence)} frames, the estimate has {len(estimate.registered)}"
         )
+    sequence = as_given(sequence)
     kept = np.flatnonzero(estimate.registered)
     number = np.cumsum(estimate.registered) - 1
 
@@ -447,7 +449,8 @@ def with_estimated_poses(
     if estimate.calibration is not None:
         posed = with_calibration(posed, estimate.calibration, ingest)
     # Before, the depth of a few frames told the scale of the poses.
-    return without_scarce_depth(posed)
+    error = "auto" if ingest is None else ingest.depth_error
+    return with_depth_error(without_scarce_depth(posed), error)
 
 
 def _run(job: PoseJob, name: str) -> PoseJobResult:

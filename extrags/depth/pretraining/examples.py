@@ -11,11 +11,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from extrags.depth.completion import POINTS, CompletionInputs, CompletionNetwork, completion_inputs
-from extrags.depth.frames import PosedFrames, select_sources
+from extrags.depth.frames import PosedFrames
 from extrags.depth.pretraining.cavities import Cavities, Kind
 from extrags.depth.pretraining.photographs import Clips, photograph
 from extrags.depth.pretraining.points import triangulated_points
 from extrags.depth.stereo import SECOND_SWEEP, StereoDepth, StereoSettings, multi_view_stereo, sweep_around
+from extrags.source_frames import select_sources
 
 __all__ = ["SIZES", "Examples", "make_examples"]
 

@@ -12,13 +12,14 @@ import torch
 
 from extrags.depth import matching, native
 from extrags.depth.consistency import agreement
-from extrags.depth.frames import PosedFrames, select_sources
+from extrags.depth.frames import PosedFrames
 from extrags.depth.shading import fit_shading
 from extrags.depth.stereo import StereoSettings, multi_view_stereo, sweep_around
 from extrags.errors import ShapeError
 from extrags.raster import native as raster_native
 from extrags.raster.native import compiled_kernels
 from extrags.raster.native import set_num_threads as set_threads
+from extrags.source_frames import select_sources
 from extrags.stress.inputs import plane_views
 from tests.extrags.depth.planes import inside_sphere, on, tilted_plane
 from tests.extrags.forked_child import exit_code_of_child

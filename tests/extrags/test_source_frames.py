@@ -7,7 +7,7 @@ import pytest
 from jaxtyping import Float, Int
 
 from extrags.cameras import rotation_about
-from extrags.depth.frames import ANGLE_SPREAD, BEST_ANGLE_DEG, MAX_TURN_DEG, select_sources
+from extrags.source_frames import ANGLE_SPREAD, BEST_ANGLE_DEG, MAX_TURN_DEG, select_sources
 
 SIZE = (64, 96)
 

@@ -1,0 +1,145 @@
+"""What training frames tell of their measured depth, on a phantom whose depth is exact."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import extrags
+from extrags.cameras import pixel_rays
+from extrags.measured_depth import as_given, measured_depth_error, with_depth_error
+from extrags.sequence import EndoscopicSequence, Split
+from extrags.training.reconstruction import refines_poses
+from tests.extrags.depth.withheld import recorded
+
+Change = Callable[[int, np.ndarray], np.ndarray]
+
+
+@pytest.fixture(scope="module")
+def exact() -> EndoscopicSequence:
+    return recorded(10, 96, 72)
+
+
+def with_depth(sequence: EndoscopicSequence, changed: Change) -> EndoscopicSequence:
+    assert sequence.depth_mm is not None
+    depth = np.stack([changed(k, depth) for k, depth in enumerate(sequence.depth_mm)])
+    return replace(sequence, depth_mm=depth.astype(np.float32))
+
+
+def smoothly_wrong(share: float) -> Change:
+    """Each frame by a smooth error of its own, of this standard deviation."""
+
+    def changed(frame: int, depth: np.ndarray) -> np.ndarray:
+        noise = np.random.default_rng(frame).normal(size=depth.shape)
+        field = cv2.GaussianBlur(noise, (0, 0), 0.2 * depth.shape[1])
+        return np.asarray(depth * np.exp(share * field / field.std()))
+
+    return changed
+
+
+def displaced(sequence: EndoscopicSequence, turn_deg: float, shift_mm: float) -> EndoscopicSequence:
+    generator = np.random.default_rng(0)
+    poses = sequence.cameras.world_from_camera.copy()
+    for pose in poses:
+        turn = Rotation.from_rotvec(np.radians(turn_deg) * generator.normal(size=3) / np.sqrt(3))
+        pose[:3, :3] = pose[:3, :3] @ turn.as_matrix()
+        pose[:3, 3] += shift_mm * generator.normal(size=3) / np.sqrt(3)
+    return replace(sequence, world_from_camera=poses)
+
+
+def test_exact_depth_is_taken_as_it_is(exact: EndoscopicSequence, caplog: pytest.LogCaptureFixture) -> None:
+    found = measured_depth_error(exact)
+    assert found is not None
+    assert found.error < 1e-3
+    assert (found.unit, found.along_ray) == (1.0, False)
+    assert with_depth_error(exact) is exact
+    assert exact.median_depth_error == 0
+    assert not caplog.messages
+
+
+@pytest.mark.parametrize("share", [0.03, 0.06])
+def test_smooth_errors_are_found_and_measured(
+    exact: EndoscopicSequence, share: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    given = with_depth(exact, smoothly_wrong(share))
+    found = with_depth_error(given)
+    assert found.depth_error is not None
+    assert found.median_depth_error == pytest.approx(share, rel=0.35)
+    np.testing.assert_array_equal(found.depth_mm, given.depth_mm)
+    # The evaluation still compares with what was measured, and poses are not tried against such depth.
+    np.testing.assert_array_equal(found.true_depth_mm, given.depth_mm)
+    assert refines_poses(given.training_part(), extrags.PROFILES["balanced"].coarse)
+    assert not refines_poses(found.training_part(), extrags.PROFILES["balanced"].coarse)
+    assert "training frames disagree about their depth" in caplog.text
+    assert with_depth_error(found) is found
+    undone = as_given(found)
+    assert undone.depth_error is undone.withheld_depth_mm is None
+    np.testing.assert_array_equal(undone.depth_mm, given.depth_mm)
+
+
+def test_a_frame_that_is_farther_off_is_told_apart(exact: EndoscopicSequence) -> None:
+    def one_much_worse(frame: int, depth: np.ndarray) -> np.ndarray:
+        return smoothly_wrong(0.15 if frame == 4 else 0.02)(frame, depth)
+
+    found = measured_depth_error(with_depth(exact, one_much_worse))
+    assert found is not None
+    assert found.frame_error.argmax() == 4
+    assert found.frame_error[4] > 3 * np.median(found.frame_error)
+
+
+@pytest.mark.parametrize("factor", [1.0, 2.0])
+def test_poses_that_are_off_are_no_error_of_depth(exact: EndoscopicSequence, factor: float) -> None:
+    moved = displaced(exact, 0.5 * factor, 0.3 * factor)
+    found = measured_depth_error(moved)
+    assert found is not None
+    assert found.beyond_motion < 0.2 * found.error
+    assert with_depth_error(moved) is moved
+
+
+@pytest.mark.parametrize("factor", [0.8, 1.1])
+def test_another_unit_is_converted(
+    exact: EndoscopicSequence, factor: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    found = with_depth_error(with_depth(exact, lambda _, depth: factor * depth))
+    assert found.depth_error is None
+    np.testing.assert_allclose(found.depth_mm, exact.depth_mm, rtol=0.005)
+    assert f"multiplied by {1 / factor:.3f}" in caplog.text
+
+
+def test_depth_along_the_ray_is_converted(
+    exact: EndoscopicSequence, caplog: pytest.LogCaptureFixture
+) -> None:
+    lengths = np.linalg.norm(pixel_rays(exact.cameras), axis=-1)
+    found = with_depth_error(with_depth(exact, lambda frame, depth: depth * lengths[frame]))
+    assert found.depth_error is None
+    np.testing.assert_allclose(found.depth_mm, exact.depth_mm, rtol=1e-5)
+    assert "it is converted to z-depth" in caplog.text
+
+
+def test_a_number_is_taken_for_it(exact: EndoscopicSequence) -> None:
+    wrong = with_depth(exact, smoothly_wrong(0.06))
+    assert with_depth_error(wrong, 0) is wrong
+    found = with_depth_error(exact, 0.1)
+    assert found.depth_error is not None
+    assert np.unique(found.depth_error).tolist() == [np.float32(0.1)]
+
+
+def test_nothing_is_told_without_other_frames(exact: EndoscopicSequence) -> None:
+    wrong = with_depth(exact, smoothly_wrong(0.06))
+    alone = replace(wrong, split=Split("one", np.array([0]), np.array([5])))
+    for given in (alone, replace(wrong, world_from_camera=None), exact.without_training_depth()):
+        assert measured_depth_error(given) is None
+        assert with_depth_error(given) is given
+
+
+def test_arrays_in_memory_are_judged_alike(exact: EndoscopicSequence) -> None:
+    wrong = with_depth(exact, smoothly_wrong(0.06))
+    found = extrags.sequence_from_arrays(
+        exact.rgb, K=exact.K, world_from_camera=exact.world_from_camera, depth_mm=wrong.depth_mm
+    )
+    assert found.median_depth_error > 0.03
