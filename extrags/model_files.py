@@ -1,4 +1,4 @@
-"""Folders of pretrained models: their digests, without reading gigabytes, and whether they are whole."""
+"""Folders of pretrained models: digests of their content, and whether they are whole."""
 
 from __future__ import annotations
 
@@ -7,16 +7,18 @@ import json
 from collections.abc import Mapping
 from pathlib import Path
 
+from extrags.file_digests import size_and_digest
+
 __all__ = ["files_fingerprint", "fingerprint", "lacking_weights"]
 
-EDGE_BYTES = 1 << 20
-"""Bytes read at both ends of each file: large weight files hardly change in the middle alone."""
-
-
 def fingerprint(folder: Path) -> str:
-    """Digest of a saved model: names and sizes of its files, small ones whole, weights at both ends.
+    """Digest of a saved model: names and whole content of its files, hidden ones left out.
 
-    This detects that a folder holds another model than when it was looked at before.
+    This detects that a folder holds another model than when it was looked at before. Files that do not change
+    are read once in a process (`size_and_digest`).
+
+    Raises:
+        OSError: when a file cannot be read.
     """
     found = {path.relative_to(folder): path for path in folder.rglob("*") if path.is_file()}
     return files_fingerprint(
@@ -33,16 +35,14 @@ def files_fingerprint(files: Mapping[str, Path]) -> str:
 
     Args:
         files: by the names that enter the digest; their folders do not.
+
+    Raises:
+        OSError: when a file cannot be read.
     """
     digest = hashlib.blake2b(digest_size=16)
     for name, file in sorted(files.items()):
-        size = file.stat().st_size
-        digest.update(f"{name}\0{size}\0".encode())
-        with file.open("rb") as stream:
-            digest.update(stream.read(EDGE_BYTES))
-            if size > EDGE_BYTES:
-                stream.seek(max(EDGE_BYTES, size - EDGE_BYTES))
-                digest.update(stream.read(EDGE_BYTES))
+        size, content = size_and_digest(file)
+        digest.update(f"{name}\0{size}\0{content}\0".encode())
     return digest.hexdigest()
 
 

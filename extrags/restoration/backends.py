@@ -12,7 +12,7 @@ from extrags.config.backends import BACKEND_NAME, BACKENDS, BackendEntry
 from extrags.errors import ConfigError, WeightsError
 from extrags.model_files import files_fingerprint
 from extrags.restoration.description import DESCRIPTION, read_description
-from extrags.restoration.pretrained.captions import check_source
+from extrags.restoration.pretrained.captions import check_source, endpoint_digest
 from extrags.restoration.protocol import Backend, Enhancer
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
@@ -89,9 +89,10 @@ def check_restorer(config: EnhanceConfig) -> None:
 
 
 def restorer_digest(config: EnhanceConfig) -> str | None:
-    """Digest of the pretrained model that a scene's restorer starts from, and of its file of captions.
+    """Digest of the pretrained model that a scene's restorer starts from, and of the source of its captions.
 
-    Where they are stored does not change it.
+    A file of captions counts by its content, an endpoint by its address without credentials. Where model and
+    file are stored does not change the digest.
 
     Args:
         config: backend, model and caption.
@@ -104,14 +105,19 @@ def restorer_digest(config: EnhanceConfig) -> str | None:
     """
     backend = backend_of(config.backend)
     model = backend.digest(config)
-    texts = check_source(config.caption) if backend.needs_text(config) else None
+    parts = [str(model)]
+    if backend.needs_text(config):
+        texts, endpoint = check_source(config.caption), endpoint_digest(config.caption)
+        if texts is not None:
+            parts.append(files_fingerprint({"texts": texts}))
+        if endpoint is not None:
+            parts.append(f"endpoint {endpoint}")
     version = BACKENDS[config.backend].version
-    if texts is None and version == 0:
-        return model
-    parts = str(model) if texts is None else f"{model} {files_fingerprint({'texts': texts})}"
     if version > 0:
-        parts += f" {backend.name} version {version}"
-    return hashlib.blake2b(parts.encode(), digest_size=16).hexdigest()
+        parts.append(f"{backend.name} version {version}")
+    if len(parts) == 1:
+        return model
+    return hashlib.blake2b(" ".join(parts).encode(), digest_size=16).hexdigest()
 
 
 @one_torch_thread()

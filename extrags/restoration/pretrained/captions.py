@@ -31,11 +31,20 @@ from extrags.data_directories import cache_directory
 from extrags.errors import ConfigError, ExtragsError, SourceError, SourceNotFoundError
 from extrags.events import MetricRecorded, emit
 from extrags.output_files import write_file
+from extrags.redaction import without_credentials
 from extrags.sequence import EndoscopicSequence
 from extrags.user_paths import expanded
 from extrags.yaml_text import read_yaml
 
-__all__ = ["CACHE_VARIABLE", "KEY_VARIABLE", "URL_VARIABLE", "Caption", "caption_of", "check_source"]
+__all__ = [
+    "CACHE_VARIABLE",
+    "KEY_VARIABLE",
+    "URL_VARIABLE",
+    "Caption",
+    "caption_of",
+    "check_source",
+    "endpoint_digest",
+]
 
 URL_VARIABLE = "EXTRAGS_CAPTION_URL"
 KEY_VARIABLE = "EXTRAGS_CAPTION_KEY"
@@ -131,6 +140,22 @@ def check_source(config: CaptionConfig) -> Path | None:
     if not file.is_file():
         raise SourceNotFoundError("no such file; expected {name of the sequence: text}", file=file)
     return file
+
+
+def endpoint_digest(config: CaptionConfig) -> str | None:
+    """Digest of the address of the endpoint that captions come from, for cache keys; None for other sources.
+
+    Two servers may answer differently under one name of a model. Credentials in the address do not count: a
+    renewed key leads to the same answers.
+
+    Raises:
+        ConfigError: as `check_source`.
+    """
+    if config.source != "endpoint":
+        return None
+    check_source(config)
+    url = without_credentials(os.environ[URL_VARIABLE].rstrip("/"))
+    return hashlib.blake2b(url.encode(), digest_size=16).hexdigest()
 
 
 def _from_file(name: str, file: Path) -> str:

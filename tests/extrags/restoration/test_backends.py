@@ -140,6 +140,18 @@ class TestEveryBackend:
             digests.add(restorer_digest(case.config.model_copy(update={"caption": caption})))
         assert len(digests) == (2 if backend_of(case.name).needs_text(case.config) else 1)
 
+    def test_the_endpoint_of_captions_counts_without_its_credentials(
+        self, case: Case, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        asking = CaptionConfig(source="endpoint", model="seer-1")
+        config = case.config.model_copy(update={"caption": asking})
+        digests = []
+        for url in ("https://a:one@host/v1", "https://a:two@host/v1/", "https://other/v1"):
+            monkeypatch.setenv("EXTRAGS_CAPTION_URL", url)
+            digests.append(restorer_digest(config))
+        assert digests[0] == digests[1]
+        assert (digests[1] != digests[2]) == backend_of(case.name).needs_text(config)
+
     def test_restored_views_are_images(self, case: Case) -> None:
         found = case.restoration
         assert found.rgb.shape == (len(case.clip), HEIGHT, WIDTH, 3)

@@ -293,3 +293,12 @@ def test_the_fingerprint_sees_names_sizes_and_content(tmp_path: Path) -> None:
     (tmp_path / ".cache").write_bytes(b"z")
     assert len(set(digests)) == 3
     assert fingerprint(tmp_path) == digests[-1]
+
+
+def test_the_fingerprint_sees_the_middle_of_large_files(tmp_path: Path) -> None:
+    content = bytearray(3 << 20)
+    (tmp_path / "weights.bin").write_bytes(content)
+    before = fingerprint(tmp_path)
+    content[len(content) // 2] = 1
+    (tmp_path / "weights.bin").write_bytes(content)
+    assert fingerprint(tmp_path) != before
