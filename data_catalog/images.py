@@ -28,6 +28,7 @@ __all__ = [
     "depth_suffixes_in_words",
     "image_entries",
     "image_size",
+    "is_transparent",
     "orientation",
     "read_color",
     "read_depth",
@@ -54,6 +55,8 @@ _TOP_IS_BOTTOM = (3, 4, 7, 8)
 _TIFF_SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 DEPTH_SUFFIXES = (".npy", ".tiff", ".tif", ".png")
 _MASK_THRESHOLD = 127
+_LEAST_OPACITY = 128
+"""Of 255: pixels below are more transparent than opaque."""
 _LOSSY_SUFFIXES = (".jpg", ".jpeg")
 _LOSSLESS_WEBP = b"VP8L"
 """Of the part that holds the pixels; of lossy ones it has a blank."""
@@ -189,6 +192,24 @@ def bits_per_value(file: Path) -> int:
             return int(told[0])
         # Of colours of 16 bits only the description of what is stored tells: their mode is that of 8.
         return 16 if ";16" in f"{image.mode} {image.tile}" else 8
+
+
+def is_transparent(file: Path) -> bool:
+    """Whether an image has pixels that are more transparent than opaque; False for what is no image.
+
+    Raises:
+        SourceNotFoundError: there is no such file.
+        SourceError: the file is damaged.
+    """
+    from PIL import Image
+
+    if file.suffix.lower() not in COLOR_SUFFIXES:
+        return False
+    with _image_errors(file, None, "rgb"), Image.open(file) as image:
+        # From the first bytes; only of images that have some are pixels decoded.
+        if not image.has_transparency_data:
+            return False
+        return bool((np.asarray(image.convert("RGBA"))[..., 3] < _LEAST_OPACITY).any())
 
 
 def orientation(file: Path) -> int:

@@ -23,6 +23,7 @@ from data_catalog.images import (
     COLOR_SUFFIXES,
     UPRIGHT,
     bits_per_value,
+    is_transparent,
     orientation,
     read_color,
     read_depth,
@@ -53,6 +54,8 @@ _EXACT_POSE = 1e-14
 _BRIGHTEST_OF_12_BITS = 16
 """Of 255: values of 12 bits in files of 16 stay below."""
 _BITS_OF_LARGE_VALUES = 16
+_LOOKED_AT_FOR_ALPHA = 8
+"""Frames, spread over the source: their alpha is decoded apart from their colours."""
 
 
 @dataclass(frozen=True)
@@ -194,6 +197,7 @@ def assembled(source: SourceFrames, config: IngestConfig, name: str) -> Endoscop
         emit(Progress("ingest", index, source.looked_at + len(kept)))
     pixels.tell(kept)
     tell_about_pages(kept[0].file)
+    _tell_about_transparency(kept)
     K = np.stack([pixels.samplings[frame.lens].K for frame in kept])
     rgb, mask = pixels.colors.array, pixels.masks(kept)
     if source.intrinsics == "guessed" or source.angle_alone:
@@ -416,6 +420,20 @@ def _tell_about_orientation(frames: Sequence[PosedFrame], *, upright: bool) -> N
             len(turned),
             len(frames),
             done,
+        )
+
+
+def _tell_about_transparency(frames: Sequence[PosedFrame]) -> None:
+    """Say where frames are transparent in parts that no mask file leaves out: alpha masks nothing."""
+    unmasked = [frame for frame in frames if frame.mask_file is None]
+    looked_at = [unmasked[k] for k in spread(len(unmasked), _LOOKED_AT_FOR_ALPHA)]
+    found = next((frame for frame in looked_at if is_transparent(frame.file)), None)
+    if found is not None:
+        logger.warning(
+            "%s has transparent pixels; alpha is not read, and the colours stored there count as tissue "
+            "unless a mask leaves them out",
+            found.file,
+            extra={"topic": "not read", "field": "rgb"},
         )
 
 

@@ -96,3 +96,26 @@ def test_masks_and_depth_have_the_size_of_their_images(
     )
     with pytest.raises(SourceError, match=said):
         assembled(frames, CONFIG, "made/up")
+
+
+@pytest.mark.parametrize(
+    ("opacity", "masked", "is_told"), [(127, False, True), (128, False, False), (0, True, False)]
+)
+def test_transparent_pixels_without_a_mask_are_told_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, opacity: int, masked: bool, is_told: bool
+) -> None:
+    found = source(tmp_path, [PLAIN] * 4)
+    for frame in found.frames[1:]:
+        image = Image.open(frame.file).convert("RGBA")
+        alpha = np.full((HEIGHT, WIDTH), 255, np.uint8)
+        alpha[:, :20] = opacity
+        image.putalpha(Image.fromarray(alpha))
+        image.save(frame.file)
+    if not masked:
+        found = replace(found, frames=[replace(frame, mask_file=None) for frame in found.frames])
+    assembled(found, CONFIG, "made/up")
+    told = [record for record in caplog.records if "alpha is not read" in record.getMessage()]
+    assert len(told) == int(is_told)
+    if is_told:
+        assert told[0].getMessage().startswith(f"{tmp_path / '1.png'} has transparent pixels")
+        assert getattr(told[0], "topic", None) == "not read"
