@@ -50,7 +50,7 @@ LENS_OF_POSES = (
 )
 """Why the lens of a source stays whose poses are of structure from motion."""
 
-CALIBRATION_VERSION = 5
+CALIBRATION_VERSION = 6
 """Raised by hand whenever the same file gives another camera."""
 
 _PROPORTION_TOLERANCE = 0.005

@@ -65,6 +65,8 @@ LENS_PARAMETERS: dict[str, tuple[str, ...]] = {
 """Every model understood here, with the names of its parameters; both are in COLMAP's order."""
 
 _INTRINSIC_NAMES = frozenset({"f", "fx", "fy", "cx", "cy"})
+# A field of view of COLMAP's FOV below which the model is a pinhole.
+_LEAST_OMEGA_RAD = 1e-9
 # Directions and radii in which a polynomial is searched for its fold.
 _FOLD_DIRECTIONS = 16
 _FOLD_STEPS = 2000
@@ -179,6 +181,18 @@ class Lens:
         return np.array([[fx, 0, self.value("cx")], [0, fy, self.value("cy")], [0, 0, 1.0]])
 
     @property
+    def central_focal_px(self) -> float:
+        """Focal length of the pinhole of square pixels that keeps the resolution at the centre, in pixels.
+
+        It is that of the linear part, but for FOV, whose distortion magnifies the centre.
+        """
+        focal = float(np.sqrt(self.K[0, 0] * self.K[1, 1]))
+        omega = self.value("omega")
+        if abs(omega) < _LEAST_OMEGA_RAD:
+            return focal
+        return focal * float(2 * np.tan(omega / 2) / omega)
+
+    @property
     def is_pinhole(self) -> bool:
         """Whether the linear part is all there is."""
         if self.model == "FOV" or self.model.endswith("FISHEYE"):
@@ -207,7 +221,7 @@ class Lens:
         safe = np.maximum(r, 1e-12)
         if self.model == "FOV":
             omega = self.value("omega")
-            if abs(omega) < 1e-9:
+            if abs(omega) < _LEAST_OMEGA_RAD:
                 return x, y
             scale = np.where(r > 1e-9, np.arctan(2 * r * np.tan(omega / 2)) / (omega * safe), 1.0)
             return x * scale, y * scale
@@ -310,7 +324,7 @@ class Undistortion:
             size: width and height of the pinhole's image, in pixels; None keeps the source's.
         """
         width, height = (lens.width, lens.height) if size is None else size
-        focal = float(np.sqrt(lens.K[0, 0] * lens.K[1, 1]))
+        focal = lens.central_focal_px
         if field_of_view_deg is not None:
             focal = float(width / 2 / np.tan(np.radians(field_of_view_deg) / 2))
         K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
@@ -485,7 +499,7 @@ def pinhole_size(lens: Lens, config: IngestConfig) -> tuple[int, int] | None:
     """
     if config.field_of_view_deg is None or not keeps_central_resolution(config):
         return None
-    focal = float(np.sqrt(lens.K[0, 0] * lens.K[1, 1]))
+    focal = lens.central_focal_px
     return size_for_focal(lens.width, lens.height, float(np.radians(config.field_of_view_deg)), focal)
 
 

@@ -11,6 +11,7 @@ from extrags.file_digests import size_and_digest
 
 __all__ = ["files_fingerprint", "fingerprint", "lacking_weights"]
 
+
 def fingerprint(folder: Path) -> str:
     """Digest of a saved model: names and whole content of its files, hidden ones left out.
 

@@ -45,7 +45,7 @@ class LensCalibration:
     @property
     def focal_px(self) -> float:
         """Focal length in use."""
-        return float(np.sqrt(self.lens.K[0, 0] * self.lens.K[1, 1]))
+        return self.lens.central_focal_px
 
     @property
     def focal_std_px(self) -> float | None:

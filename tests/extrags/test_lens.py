@@ -282,3 +282,21 @@ def test_a_wider_pinhole_grows_to_keep_the_resolution_of_the_centre() -> None:
     assert Undistortion.planned(lens, 120.0, size=size).K[0, 0] == pytest.approx(90, rel=2e-3)
     assert Undistortion.planned(lens).K[0, 0] == pytest.approx(90)
     assert pinhole_size(lens, IngestConfig(field_of_view_deg=120.0, size="source")) is None
+
+
+@pytest.mark.parametrize("model", sorted(LENS_PARAMETERS))
+def test_the_central_focal_length_is_the_slope_of_the_model_at_its_axis(model: str) -> None:
+    values = {"f": 90.0, "fx": 100.0, "fy": 81.0, "cx": 80.0, "cy": 64.0, "omega": 0.9, "alpha": 0.5}
+    lens = Lens(model, tuple(values.get(name, 0.02) for name in LENS_PARAMETERS[model]), WIDTH, HEIGHT)
+    step = np.array([-1e-4, 1e-4])
+    across, down = lens.project(step, np.zeros(2))[0], lens.project(np.zeros(2), step)[1]
+    slope = np.sqrt(np.ptp(across) * np.ptp(down)) / np.ptp(step)
+    assert lens.central_focal_px == pytest.approx(slope, rel=1e-6)
+    assert Undistortion.planned(lens).K[0, 0] == lens.central_focal_px
+
+
+def test_a_pinhole_of_a_fov_lens_keeps_the_resolution_of_the_centre() -> None:
+    lens = Lens("FOV", (100.0, 100.0, 80.0, 64.0, 1.2), WIDTH, HEIGHT)
+    size = pinhole_size(lens, IngestConfig(field_of_view_deg=100.0, size="central"))
+    assert size is not None
+    assert Undistortion.planned(lens, 100.0, size=size).K[0, 0] == pytest.approx(114.02, rel=5e-3)
