@@ -286,14 +286,20 @@ def _take(folder: Path, run: FlowRun) -> int | None:
     """Write and lock the lease of a run; its descriptor."""
     path = folder / _name(run)
     said = json.dumps({"flow_run": str(run.id), "name": run.name, "host": _host(), "process": os.getpid()})
+    # Locked under another name first: under its own it is never free while the run lives.
+    part = path.with_suffix(".part")
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        # Locked under another name first: under its own it is never free while the run lives.
-        part = path.with_suffix(".part")
         descriptor = os.open(part, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o644)
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        os.write(descriptor, said.encode())
-        part.rename(path)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            os.write(descriptor, said.encode())
+            part.rename(path)
+        except BaseException:
+            os.close(descriptor)
+            with suppress(OSError):
+                part.unlink(missing_ok=True)
+            raise
     except OSError as error:
         log.warning("this run has no lease: %s: %s", path, reason_of(error))
         return None

@@ -9,6 +9,7 @@ both compute it, which is harmless: artefacts are written atomically, and the fi
 from __future__ import annotations
 
 import asyncio
+import errno
 import fcntl
 import logging
 import os
@@ -19,13 +20,15 @@ from typing import Any
 
 from prefect.locking.protocol import LockManager
 
-from extrags.errors import StoreError
+from extrags.errors import StoreError, reason_of
 
 __all__ = ["FlockManager", "sweep_locks"]
 
 log = logging.getLogger(__name__)
 
 POLL_SECONDS = 0.05
+_WITHOUT_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP)
+"""What `flock` says on file systems that have none, as some mounts of networks."""
 
 
 class FlockManager(LockManager):
@@ -63,7 +66,7 @@ class FlockManager(LockManager):
         `hold_timeout` is not needed: a lock never outlives its process.
 
         Raises:
-            StoreError: when the lock's file may not be opened.
+            StoreError: when the lock's file may not be opened, or its file system has no locks.
         """
         if self.is_lock_holder(key, holder):
             return True
@@ -97,11 +100,17 @@ class FlockManager(LockManager):
             del self._held[key]
         # Unlinked while still locked: a process that waits on this inode then finds that the path is gone
         # or refers to another inode, and retries.
-        self._path(key).unlink(missing_ok=True)
-        os.close(descriptor)
+        try:
+            self._path(key).unlink(missing_ok=True)
+        finally:
+            os.close(descriptor)
 
     def is_locked(self, key: str) -> bool:
-        """Whether anybody holds the lock of a key."""
+        """Whether anybody holds the lock of a key.
+
+        Raises:
+            StoreError: when its file system has no locks.
+        """
         with self._guard:
             if key in self._held:
                 return True
@@ -111,11 +120,7 @@ class FlockManager(LockManager):
         except FileNotFoundError:
             return False
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return True
-        else:
-            return False
+            return not _locked(descriptor, self._path(key), fcntl.LOCK_SH)
         finally:
             os.close(descriptor)
 
@@ -145,7 +150,7 @@ def _lock_file(path: Path, timeout: float | None) -> int | None:
     """Open and lock the file at a path, retrying if it is replaced meanwhile; None on timeout.
 
     Raises:
-        StoreError: when the file may not be opened, as one of another user.
+        StoreError: when the file may not be opened, as one of another user, or its file system has no locks.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     end = None if timeout is None else time.monotonic() + timeout
@@ -159,19 +164,51 @@ def _lock_file(path: Path, timeout: float | None) -> int | None:
                 "that may write its folders and files (umask 002)"
             ) from error
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if os.path.samestat(os.fstat(descriptor), os.stat(path)):
+            wait = not _locked(descriptor, path, fcntl.LOCK_EX)
+            # Its former holder may have removed the file between our open and our lock.
+            if not wait and _is_at(descriptor, path):
                 return descriptor
-            wait = False  # Its former holder removed the file between our open and our lock.
-        except BlockingIOError:
-            wait = True
-        except FileNotFoundError:
-            wait = False
+        except BaseException:
+            os.close(descriptor)
+            raise
         os.close(descriptor)
         if wait:
             if end is not None and time.monotonic() >= end:
                 return None
             time.sleep(POLL_SECONDS)
+
+
+def _locked(descriptor: int, path: Path, kind: int) -> bool:
+    """Lock an open file without waiting; False where another holds it.
+
+    Args:
+        descriptor: of the open file.
+        path: its place, for messages.
+        kind: LOCK_EX or LOCK_SH.
+
+    Raises:
+        StoreError: when it cannot be locked at all.
+    """
+    try:
+        fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError as error:
+        if error.errno not in _WITHOUT_LOCKS:
+            raise StoreError(f"{path} cannot be locked: {reason_of(error)}") from error
+        raise StoreError(
+            f"{path} cannot be locked: its file system has no locks ({reason_of(error)}). A store needs a "
+            "local file system, NFSv4 or an object store"
+        ) from error
+    return True
+
+
+def _is_at(descriptor: int, path: Path) -> bool:
+    """Whether an open file is still the one at a path."""
+    try:
+        return os.path.samestat(os.fstat(descriptor), os.stat(path))
+    except FileNotFoundError:
+        return False
 
 
 def sweep_locks(directory: Path) -> list[str]:

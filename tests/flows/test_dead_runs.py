@@ -173,6 +173,20 @@ def test_a_lease_that_another_machine_wrote_says_nothing(
     assert settle_dead_runs(str(tmp_path)) == ([], set())
 
 
+def test_a_lease_that_cannot_be_locked_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def refusing(descriptor: int, operation: int) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    open_before = len(os.listdir("/proc/self/fd"))
+    monkeypatch.setattr(fcntl, "flock", refusing)
+    assert flows.leases._take(tmp_path / "leases", FlowRun(flow_id=uuid4())) is None
+    assert "this run has no lease" in caplog.text
+    assert list((tmp_path / "leases").iterdir()) == []
+    assert len(os.listdir("/proc/self/fd")) == open_before
+
+
 DAY_S = 86400.0
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import errno
+import fcntl
 import multiprocessing
 import os
 import pickle
@@ -116,6 +117,30 @@ def test_a_lock_of_another_user_stays_and_is_named(tmp_path: Path, monkeypatch: 
     assert not manager.is_locked("k")
     with pytest.raises(StoreError, match=r"k\.lock cannot be opened: Permission denied"):
         manager.acquire_lock("k", "b", acquire_timeout=0.0)
+
+
+@pytest.mark.parametrize(
+    ("number", "said"),
+    [
+        (errno.ENOLCK, r"k\.lock cannot be locked: its file system has no locks \(No locks available\)"),
+        (errno.EOPNOTSUPP, r"k\.lock cannot be locked: its file system has no locks"),
+        (errno.EIO, r"k\.lock cannot be locked: Input/output error"),
+    ],
+)
+def test_a_file_system_without_locks_is_named_and_nothing_stays_open(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, said: str
+) -> None:
+    def refusing(descriptor: int, operation: int) -> None:
+        raise OSError(number, os.strerror(number))
+
+    manager, open_before = FlockManager(tmp_path), len(os.listdir("/proc/self/fd"))
+    monkeypatch.setattr(fcntl, "flock", refusing)
+    with pytest.raises(StoreError, match=said):
+        manager.acquire_lock("k", "a")
+    with pytest.raises(StoreError, match=said):
+        manager.is_locked("k")
+    assert sweep_locks(tmp_path) == []
+    assert len(os.listdir("/proc/self/fd")) == open_before
 
 
 def test_a_lock_that_may_not_be_removed_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
