@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from data_catalog.checks import check_depth, check_intrinsics, check_pose
 from data_catalog.depth_steps import DepthSteps
@@ -39,7 +39,7 @@ from extrags.cameras import Cameras, rotation_about
 from extrags.config import IngestConfig
 from extrags.errors import SourceError
 from extrags.events import Progress, emit
-from extrags.frame_stacks import FrameStack, stacked
+from extrags.frame_stacks import FrameStack, frames_of, stacked
 from extrags.lens import Lens
 from extrags.observed_surface import observed_by_depth
 from extrags.provenance import StereoCamera
@@ -183,8 +183,8 @@ def assembled(source: SourceFrames, config: IngestConfig, name: str) -> Endoscop
         name: of the sequence.
 
     Raises:
-        SourceError: a file is wrong or of another size than its camera, or all pictures are black; names
-            file, frame and field.
+        SourceError: a file is wrong or of another size than its camera, all pictures are black, or the masks
+            of too many frames leave no pixel; names file, frame and field.
         PoseError: a pose that is no rigid motion.
         ConfigError: a size that the source cannot give.
     """
@@ -198,14 +198,20 @@ def assembled(source: SourceFrames, config: IngestConfig, name: str) -> Endoscop
     pixels.tell(kept)
     tell_about_pages(kept[0].file)
     _tell_about_transparency(kept)
-    K = np.stack([pixels.samplings[frame.lens].K for frame in kept])
     rgb, mask = pixels.colors.array, pixels.masks(kept)
+    depth_mm = pixels.depths.array if len(pixels.depths) else None
+    shown = _not_masked_throughout(kept, mask, config)
+    if len(shown) < len(kept):
+        kept = [kept[index] for index in shown]
+        split, world_from_camera = _split(kept, source, config), _poses(kept, source)
+        rgb, mask = frames_of(rgb, shown), frames_of(mask, shown)
+        depth_mm = None if depth_mm is None else frames_of(depth_mm, shown)
+    K = np.stack([pixels.samplings[frame.lens].K for frame in kept])
     if source.intrinsics == "guessed" or source.angle_alone:
         K = fitted_to_picture(K, mask, rgb)
     lens = pixels.lens(kept, source.pose_file)
     if world_from_camera is not None:
         world_from_camera = _rolled(world_from_camera, [pixels.samplings[f.lens].roll_rad for f in kept])
-    depth_mm = pixels.depths.array if len(pixels.depths) else None
     observed = None
     if world_from_camera is not None:
         cameras = Cameras(K, world_from_camera, rgb.shape[2], rgb.shape[1], lens)
@@ -435,6 +441,40 @@ def _tell_about_transparency(frames: Sequence[PosedFrame]) -> None:
             found.file,
             extra={"topic": "not read", "field": "rgb"},
         )
+
+
+def _not_masked_throughout(
+    frames: Sequence[PosedFrame], masks: Bool[np.ndarray, "f h w"], config: IngestConfig
+) -> Int[np.ndarray, "n"]:
+    """Indices of the frames of which something is seen; others are left out with a warning.
+
+    An instrument or a smear covers single frames of many recordings.
+
+    Raises:
+        SourceError: when there are more of these than may be absent, or nothing else.
+    """
+    empty = [
+        index
+        for index, (frame, mask) in enumerate(zip(frames, masks, strict=True))
+        if frame.mask_file is not None and not mask.any()
+    ]
+    if empty:
+        first = frames[empty[0]]
+        if len(empty) == len(frames) or len(empty) > config.max_absent_share * len(frames):
+            raise SourceError(
+                f"the masks of {len(empty)} of {len(frames)} frames, this one first, leave no pixel; at most "
+                f"{config.max_absent_share:.0%} may do so (ingest.max_absent_share)",
+                file=first.mask_file,
+                frame=first.label,
+                field="mask",
+            )
+        logger.warning(
+            "%s: the masks of %d of %d frames, this one first, leave no pixel; these frames are left out",
+            first.mask_file,
+            len(empty),
+            len(frames),
+        )
+    return np.setdiff1d(np.arange(len(frames)), empty)
 
 
 def _check_poses_of_all_or_none(source: SourceFrames) -> None:

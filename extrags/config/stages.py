@@ -77,8 +77,9 @@ class IngestConfig(StageConfig):
         0.5,
         ge=0,
         lt=1,
-        description="frames that a list of poses names and that are absent are left out with a warning; the "
-        "source is refused where more than this share is absent",
+        description="frames that a list of poses names and that are absent, and frames of which a mask file "
+        "leaves no pixel, are left out with a warning; the source is refused where either are more than this "
+        "share",
     )
     withhold_depth: bool = Field(
         False,

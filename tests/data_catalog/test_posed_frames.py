@@ -119,3 +119,45 @@ def test_transparent_pixels_without_a_mask_are_told_once(
     if is_told:
         assert told[0].getMessage().startswith(f"{tmp_path / '1.png'} has transparent pixels")
         assert getattr(told[0], "topic", None) == "not read"
+
+
+class TestFramesMaskedThroughout:
+    @staticmethod
+    def covered(folder: Path, count: int) -> SourceFrames:
+        """Six frames, the first few under a mask of their own that leaves nothing."""
+        poses = np.tile(np.eye(4), (6, 1, 1))
+        poses[:, 0, 3] = np.arange(6)
+        found = source(folder, [PLAIN] * 6, poses)
+        Image.fromarray(np.zeros((HEIGHT, WIDTH), np.uint8)).save(folder / "black.png")
+        depth_file = folder / "depth.npy"
+        np.save(depth_file, np.full((HEIGHT, WIDTH), 9.0, np.float32))
+        frames = [
+            replace(
+                frame,
+                depth_file=depth_file,
+                mask_file=folder / "black.png" if index in (1, 4, 0)[:count] else frame.mask_file,
+            )
+            for index, frame in enumerate(found.frames)
+        ]
+        return replace(found, frames=frames)
+
+    def test_they_are_left_out_with_a_warning(self, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+        whole = assembled(self.covered(tmp_path, 0), CONFIG, "made/up")
+        found = assembled(self.covered(tmp_path, 2), CONFIG, "made/up")
+        assert "black.png: the masks of 2 of 6 frames, this one first, leave no pixel" in caplog.text
+        kept = [0, 2, 3, 5]
+        assert found.frame_names == ("0", "2", "3", "5")
+        assert found.world_from_camera is not None
+        assert found.world_from_camera[:, 0, 3].tolist() == kept
+        for one, all_of_them in ((found.rgb, whole.rgb), (found.mask, whole.mask), (found.K, whole.K)):
+            np.testing.assert_array_equal(one, all_of_them[kept])
+        assert found.depth_mm is not None
+        assert found.depth_mm.shape == found.mask.shape
+        assert sorted([*found.split.train, *found.split.test]) == [0, 1, 2, 3]
+
+    @pytest.mark.parametrize(("count", "share"), [(2, 0.3), (3, 0.4)])
+    def test_too_many_are_refused(self, tmp_path: Path, count: int, share: float) -> None:
+        config = CONFIG.model_copy(update={"max_absent_share": share})
+        with pytest.raises(SourceError, match=f"masks of {count} of 6 frames.*leave no pixel") as caught:
+            assembled(self.covered(tmp_path, count), config, "made/up")
+        assert caught.value.field == "mask"
