@@ -9,11 +9,9 @@ from jaxtyping import Bool, Float, UInt8
 
 from extrags.config import IngestConfig
 from extrags.errors import ConfigError, SourceError
+from extrags.lens import resized_depth
 
 __all__ = ["Resampling"]
-
-# Neighbouring depths that differ by more than this share lie on different surfaces.
-_FOLD_STEP = 0.05
 
 
 @dataclass(frozen=True)
@@ -138,21 +136,7 @@ class Resampling:
         if (self.width, self.height) == (self.crop_width, self.crop_height):
             # The new pixels are the old ones: the same numbers, in a fortieth of the time.
             return crop.astype(np.float32)
-        x = (np.arange(self.width) + 0.5) * self.crop_width / self.width - 0.5
-        y = (np.arange(self.height) + 0.5) * self.crop_height / self.height - 0.5
-        i = np.clip(np.floor(y).astype(int), 0, max(self.crop_height - 2, 0))
-        j = np.clip(np.floor(x).astype(int), 0, max(self.crop_width - 2, 0))
-        a = np.clip(y - i, 0, 1)[:, None]
-        b = np.clip(x - j, 0, 1)[None, :]
-        corners = np.stack([crop[np.ix_(i + down, j + right)] for down in (0, 1) for right in (0, 1)]).astype(
-            np.float64
-        )
-        weights = np.stack([(1 - a) * (1 - b), (1 - a) * b, a * (1 - b), a * b])
-        nearest = np.take_along_axis(corners, weights.argmax(axis=0)[None], axis=0)[0]
-        low, high = corners.min(axis=0), corners.max(axis=0)
-        one_surface = (low > 0) & (high <= low * (1 + _FOLD_STEP))
-        inverse = (weights / np.where(corners > 0, corners, 1)).sum(axis=0)
-        return np.asarray(np.where(one_surface, 1 / np.maximum(inverse, 1e-12), nearest), dtype=np.float32)
+        return resized_depth(crop, self.width, self.height).astype(np.float32)
 
     def _cropped(self, array: np.ndarray, field: str, file: object, frame: object) -> np.ndarray:
         if array.shape[:2] != (self.source_height, self.source_width):

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from extrags.errors import ConfigError, ShapeError
 from extrags.metrics.filters import filter_figures, gaussian_weights
-from extrags.metrics.image import mean_of_known, means_in_regions, means_per_image
+from extrags.metrics.image import channels_first, mean_of_known, means_in_regions, means_per_image
 
 __all__ = ["PIXELS_PER_DEGREE", "flip", "flip_in_regions", "flip_map"]
 
@@ -85,7 +85,7 @@ def flip_map(
         raise ConfigError(f"pixels_per_degree must be positive, found {pixels_per_degree}")
     batch = render.shape[:-1]
     first, second = (
-        _opponent_from_linear(rgb_to_linear_rgb(_channels_first(image).clamp(0, 1)))
+        _opponent_from_linear(rgb_to_linear_rgb(channels_first(image).clamp(0, 1)))
         for image in (render, target)
     )
     color = _color_difference(first, second, pixels_per_degree)
@@ -247,7 +247,3 @@ def _white_xyz() -> Float[Tensor, "3"]:
 def _mixed(channels: Float[Tensor, "n 3 h w"], matrix: Float[Tensor, "3 3"]) -> Float[Tensor, "n 3 h w"]:
     n, _, height, width = channels.shape
     return (matrix.to(channels) @ channels.reshape(n, 3, -1)).reshape(n, 3, height, width)
-
-
-def _channels_first(images: Float[Tensor, "*b h w 3"]) -> Float[Tensor, "n 3 h w"]:
-    return images.reshape(-1, *images.shape[-3:]).movedim(-1, 1)

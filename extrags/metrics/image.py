@@ -20,6 +20,7 @@ __all__ = [
     "MAX_PSNR_DB",
     "SSIM_SIGMA_PX",
     "SSIM_WINDOW_PX",
+    "channels_first",
     "mean_of_known",
     "means_in_regions",
     "means_per_image",
@@ -134,8 +135,8 @@ def ssim_map(
     height, width = render.shape[-3:-1]
     if min(height, width) <= SSIM_WINDOW_PX // 2:
         raise ShapeError(f"SSIM needs images larger than {SSIM_WINDOW_PX // 2} px, found {width}x{height}")
-    x = _channels_first(render)
-    y = _channels_first(target)
+    x = channels_first(render)
+    y = channels_first(target)
     filtered = filter_figures if figures else filter_separable
     moments = torch.cat([x, y, x * x, y * y, x * y])
     window = gaussian_weights(SSIM_SIGMA_PX, SSIM_WINDOW_PX // 2)
@@ -191,7 +192,8 @@ def mean_of_known(values: list[float | None]) -> float | None:
     return sum(known) / len(known) if known else None
 
 
-def _channels_first(images: Float[Tensor, "*b h w 3"]) -> Float[Tensor, "n 3 h w"]:
+def channels_first(images: Float[Tensor, "*b h w 3"]) -> Float[Tensor, "n 3 h w"]:
+    """Images of any leading dimensions as one batch, the way filters take them."""
     return images.reshape(-1, *images.shape[-3:]).movedim(-1, 1)
 
 

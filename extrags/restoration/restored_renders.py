@@ -26,6 +26,7 @@ from torch.nn import functional
 
 from extrags.config import EnhanceConfig
 from extrags.config.stages import Finish
+from extrags.depth.hidden import shrunk
 from extrags.errors import ShapeError
 from extrags.events import MetricRecorded, Progress, emit
 from extrags.frame_stacks import FrameStack, frames_of, stacked
@@ -388,7 +389,7 @@ class _RestoredClip:
         restored = _enlarged(colors, size)
         if colors.shape[-2:] != size:
             # Where the scene knows the surface, its own detail stays; restoration changes what is coarser.
-            change = _enlarged(colors - _shrunk(rendered, colors.shape[-2:]), size)
+            change = _enlarged(colors - shrunk(rendered, colors.shape[-2:]), size)
             restored = invented * restored + (1 - invented) * (rendered + change)
         depth_mm = _mean_depth(depth, torch.from_numpy(final.depth_mm)[:, None], solid)
         return cls(clip, rendered, solid, restored, invented, to_invent, depth_mm)
@@ -409,7 +410,7 @@ class _RestoredClip:
 
     def still_to_invent(self, shares: RestoredShares) -> Float[Tensor, "t 1 h w"]:
         """What is to be invented: the less, the smaller the share of it; at none only the scene's holes."""
-        solid = _shrunk(self.solid, self.to_invent.shape[-2:])
+        solid = shrunk(self.solid, self.to_invent.shape[-2:])
         return self.to_invent * (1 - (1 - shares.invented / RESTORED_SHARE) * solid)
 
     def agreement(
@@ -417,7 +418,7 @@ class _RestoredClip:
     ) -> Float[Tensor, "t 3 h0 w0"]:
         """What is to be added for the views to agree: coarse, and found at the clip's size."""
         clip = self.clip
-        small = _shrunk(rgb, to_invent.shape[-2:])
+        small = shrunk(rgb, to_invent.shape[-2:])
         agreed = agreed_views(small, self.depth_mm, to_invent, clip.cameras, clip.exposure, clip.transfer)
         return _enlarged(agreed - small, self.size)
 
@@ -434,8 +435,8 @@ def _mean_depth(
     """
     size = restored_mm.shape[-2:]
     known = ((solid > HOLE_ALPHA) & (final_mm > 0)).to(restored_mm.dtype)
-    share = _shrunk(known, size)
-    mean_mm = _shrunk(final_mm * known, size) / share.clamp_min(LEAST_SHARE)
+    share = shrunk(known, size)
+    mean_mm = shrunk(final_mm * known, size) / share.clamp_min(LEAST_SHARE)
     ratio = torch.where(share > LEAST_SHARE, mean_mm / restored_mm, torch.ones(()))
     change = ratio.clamp_min(1e-9).log().clamp(-LARGEST_LOG_RATIO, LARGEST_LOG_RATIO)
     sigma = DEPTH_SMOOTHING_SHARE * size[-1]
@@ -444,10 +445,6 @@ def _mean_depth(
     # Not divided by less: inside a hole of the final scene the change fades out, without a step.
     smooth = smooth / filter_separable(share, window, window).clamp_min(FADING_SHARE)
     return restored_mm * (0.5 * smooth).exp()
-
-
-def _shrunk(image: Float[Tensor, "t c h0 w0"], size: torch.Size) -> Float[Tensor, "t c h w"]:
-    return image if image.shape[-2:] == size else functional.interpolate(image, size, mode="area")
 
 
 def _enlarged(image: Float[Tensor, "t c h0 w0"], size: torch.Size) -> Float[Tensor, "t c h w"]:

@@ -151,6 +151,7 @@ def grid_markdown(found: dict[str, Any]) -> str:
         found: from `flows.pipeline_grid.run_grid`.
     """
     from extrags.metrics.registry import figures
+    from extrags.report.benchmark import run_label
 
     shown = [
         figure
@@ -165,7 +166,7 @@ def grid_markdown(found: dict[str, Any]) -> str:
     for cell in found["cells"]:
         # What failed before it was read has no size.
         size = f"{cell['width']}x{cell['height']}" if cell["width"] else "-"
-        row = [_name(cell), size, cell["method"], cell["profile"], cell["budget"]]
+        row = [run_label(cell), size, cell["method"], cell["profile"], cell["budget"]]
         row += [str(cell["runs"]) + (f" ({cell['failed']} failed)" if cell["failed"] else "")]
         row += [_number(cell[key]) for key in ("seconds", "processor_seconds", "peak_mib")]
         for figure in shown:
@@ -184,13 +185,9 @@ def grid_markdown(found: dict[str, Any]) -> str:
     failed = [case for case in found["cases"] if case["error"]]
     lines += [""] * bool(failed)
     for case in failed:
-        what = f"{_name(case)}, {case['method']}, {case['profile']}, {case['budget']}, seed {case['seed']}"
-        lines.append(f"* {what} failed: {case['error']}")
+        place = f"{case['method']}, {case['profile']}, {case['budget']}, seed {case['seed']}"
+        lines.append(f"* {run_label(case)}, {place} failed: {case['error']}")
     return "\n".join(lines) + "\n"
-
-
-def _name(run: dict[str, Any]) -> str:
-    return f"{run['sequence']}@{run['setting']}" if run["setting"] else str(run["sequence"])
 
 
 def _front_members(found: dict[str, Any], names: list[str]) -> set[tuple[Any, ...]]:
