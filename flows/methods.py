@@ -338,7 +338,7 @@ METHODS: dict[str, Method] = {
     "extrags": Method("explored, restored by the diffusion, fine-tuned"),
     "paper": Method("the paper's pipeline, equation by equation", paper, {"assess": PAPER_HAS_NO_PLAN}),
     "paper-no-illum-fold": Method(
-        "the paper's ablation: paper without illumination weight and fold penalty",
+        "the paper's ablation: paper without illumination weight (its fold penalty never applies)",
         _paper_without_illumination_and_fold,
         {"assess": PAPER_HAS_NO_PLAN},
     ),
