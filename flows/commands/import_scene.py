@@ -19,7 +19,7 @@ def add_arguments(parser: Parser) -> None:
         "fine-tuning and evaluation, with the cameras and frames of the sequence it belongs to: it takes the "
         "place of the coarse scene. Scene and cameras must share one world: a COLMAP folder, or "
         "transforms.json, that the scene was trained from is such a sequence. The same as `extrags run "
-        "SEQUENCE --imported.scene FILE --imported.scale MM`; other verbs find the run by these settings."
+        "SEQUENCE --imported.scene FILE --imported.scale UNITS`; other verbs find the run by these settings."
     )
     parser.set_defaults(command=import_scene)
     parser.add_argument("file", metavar="FILE", help="3DGS PLY or SPZ")
@@ -27,10 +27,13 @@ def add_arguments(parser: Parser) -> None:
         "--sequence", required=True, metavar="SEQUENCE", help="its frames and cameras: a name or a path"
     )
     parser.add_argument(
+        "--scene-scale",
         "--units",
+        dest="units",
         type=float,
-        metavar="MM",
-        help="units of the sequence's poses, mostly millimetres, in one unit of the file (default: 1)",
+        metavar="UNITS",
+        help="the same as --imported.scale: units of the sequence's poses, mostly millimetres, in one unit "
+        "of the imported file (default: 1). It scales the file alone; --scale scales the sequence's poses",
     )
     add_method(parser)
     add_runner(parser)
@@ -55,7 +58,7 @@ def import_scene(given: argparse.Namespace) -> int:
         raise SourceNotFoundError("no such file", file=file)
     for name in ("imported.scene", "imported.scale"):
         if name in given.settings and (name == "imported.scene" or given.units is not None):
-            raise ConfigError(f"{name} is set twice: by FILE or --units, and by --{name}")
+            raise ConfigError(f"{name} is set twice: by FILE or --scene-scale, and by --{name}")
     # No default of the parser: it is shared by all that it parses.
     given.settings = {**given.settings, "imported.scene": str(file)}
     if given.units is not None:

@@ -286,8 +286,10 @@ def add_method(parser: Parser) -> None:
         "--method",
         action=_Say,
         choices=tuple(METHODS),
+        metavar="METHOD",
         default=DEFAULT_METHOD,
-        help="the whole pipeline (default), the coarse scene alone, plain 3DGS, ...",
+        help=f"what is run (default: {DEFAULT_METHOD}): "
+        + "; ".join(f"{name} ({method.summary})" for name, method in METHODS.items()).replace("%", "%%"),
     )
     add_store(parser)
     add_settings(parser)
@@ -337,7 +339,8 @@ def add_settings(parser: Parser, group: str = "") -> None:
                 metavar="MM",
                 action=_Assign,
                 default=argparse.SUPPRESS,
-                help=f"the same as --{name}: millimetres per unit of poses whose unit is arbitrary",
+                help=f"the same as --{name}: millimetres in one unit of the sequence's poses, where their "
+                "unit is arbitrary",
             )
     parser.add_argument(
         "--help-settings",

@@ -171,6 +171,7 @@ class TestCommand:
             (["{folder}/a.ply"], 1, "a compressed PLY, which is not read: export the scene as PLY or SPZ"),
             (["{file}", "--imported.scene", "b.ply"], 2, "set twice"),
             (["{file}", "--units", "2", "--imported.scale", "3"], 2, "set twice"),
+            (["{file}", "--scene-scale", "2", "--imported.scale", "3"], 2, "set twice"),
             (["{file}", "--units", "0"], 2, "imported.scale is 0"),
             (["{file}", "--coarse.refine_poses", "true"], 2, "cannot be set beside it"),
             (["{file}", "--method", "uc-nerf"], 2, "cannot be set beside it"),
