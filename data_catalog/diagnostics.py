@@ -116,9 +116,9 @@ def _missing(sequence: EndoscopicSequence) -> Iterator[Finding]:
         if anew is not None:
             yield warning(
                 "series of frames",
-                f"after {names[anew]} the numbering begins anew; all frames are taken for one recording by "
-                "one camera, and are parted into training and held-out ones as such. Give each series, as of "
-                "a left and a right camera, a folder of its own",
+                f"after {names[anew]} the numbering starts over; all frames are treated as one recording by "
+                "one camera, and split into training and held-out frames as such. Give each series, as of a "
+                "left and a right camera, a folder of its own",
                 frame=names[anew + 1],
                 field="frame names",
             )

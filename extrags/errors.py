@@ -195,7 +195,7 @@ class DamagedArtefactError(StoreError):
         if key:
             what = (
                 f"artefact {key} of stage {stage} is damaged: {what}; `extrags cache verify --repair "
-                f"--store {store}` sets it aside, and the next run makes it anew"
+                f"--store {store}` sets it aside, and the next run recomputes it"
             )
         super().__init__(what)
 

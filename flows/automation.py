@@ -47,7 +47,7 @@ def dead_run_automation(seconds: float = MISSED_BEATS * DEFAULT_HEARTBEAT_SECOND
         actions=[
             ChangeFlowRunState(
                 state=StateType.CRASHED,
-                message="Ended without a word: its heartbeat has stopped. What was finished is in the store; "
+                message="Ended unexpectedly: its heartbeat has stopped. What was finished is in the store; "
                 "a new run resumes there.",
             )
         ],

@@ -104,12 +104,12 @@ def benchmark(
     name: Annotated[str, Field(description="name of this run, for its table and page")] = "benchmark",
     limits: Annotated[StageLimits, Field(description="retries and time limits of stages")] = DEFAULT_LIMITS,
     refresh: Annotated[
-        bool, Field(description="make everything anew, so that times are those of now; adds to the history")
+        bool, Field(description="recompute everything, so that times are those of now; adds to the history")
     ] = False,
     tolerance: Annotated[
         Tolerance | None,
         Field(
-            description="how much worse than the runs before it may be; without, it is not held against them"
+            description="how much worse than the runs before it may be; without, it is not compared with them"
         ),
     ] = None,
     max_failed_share: Annotated[

@@ -60,7 +60,7 @@ def coarse_call(
         return anew, "started anew: this scene is in the store already"
     search = nearest_scene(store, name, frames, config.coarse)
     for key, why in search.refusals.items():
-        log.debug("%s: %s is not gone on from: %s", name, key, why)
+        log.debug("%s: cannot continue from %s: %s", name, key, why)
     if search.found is None:
         reason = f"started anew, no earlier scene to continue from: {search.told()}"
         log.info("%s: %s", name, reason)

@@ -105,7 +105,7 @@ class ClusterTaskRunner(DaskTaskRunner):  # type: ignore[misc]
             try:
                 self._client.unregister_worker_plugin(self._run)
             except Exception as error:
-                log.warning("the Dask workers were not told of the end: %s", reason_of(error))
+                log.warning("could not tell the Dask workers that the run has ended: %s", reason_of(error))
         super().__exit__(*args)
 
     def threads_for(self, tasks: int) -> int | None:

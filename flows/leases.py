@@ -228,7 +228,7 @@ def _age_seconds(moment: datetime.datetime) -> float:
 
 
 def _settle(client: SyncPrefectClient, run: FlowRun, reason: str) -> bool:
-    said = f"Ended without a word: {reason}. What was finished is in the store; a new run resumes there."
+    said = f"Ended unexpectedly: {reason}. What was finished is in the store; a new run resumes there."
     state: State[None] = Crashed(message=said)
     tasks = TaskRunFilter.model_validate(
         {

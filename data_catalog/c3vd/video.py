@@ -269,7 +269,7 @@ def read_pose_file(file: Path) -> tuple[Float[np.ndarray, "f 4 4"], Layout]:
     if far.size:
         frame = int(far[0])
         raise _pose_error(
-            f"the camera stands at {np.round(poses[frame, :3, 3], 1).tolist()}; expected millimetres, within "
+            f"the camera is at {np.round(poses[frame, :3, 3], 1).tolist()}; expected millimetres, within "
             f"{_LARGEST_TRANSLATION_MM / 1000:g} m of the origin",
             file,
             frame,
@@ -305,7 +305,7 @@ def _layout(matrices: Float[np.ndarray, "f 4 4"], file: Path) -> Layout:
         return "row-major"
     if not only_columns.any() and not np.allclose(matrices, matrices.transpose(0, 2, 1), atol=1e-6):
         raise PoseError(
-            "every camera stands at the origin, so nothing tells rows from columns",
+            "every camera is at the origin, so nothing tells rows from columns",
             file=file,
             field="world_from_camera",
         )

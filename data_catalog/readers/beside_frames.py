@@ -158,7 +158,7 @@ def tell_about_other_names(files: Sequence[Path]) -> None:
     if others and numbered >= max(_FEWEST_NUMBERED, _NUMBERED_PER_OTHER * len(others)):
         _tell(
             f"{files[0].parent}: beside {numbered} frames with a number in their names there is also "
-            f"{listed_files(others)}, which is read as a frame. Move away what is none",
+            f"{listed_files(others)}, which is read as a frame. Move away what is no frame",
             topic="frames",
         )
 

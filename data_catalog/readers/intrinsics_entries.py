@@ -22,7 +22,7 @@ _PAIRS = (
 )
 _BOTH = (*SIZE_NAMES["size"], "resolution")
 _KNOWN = ("K", *PINHOLE_KEYS, "field_of_view_deg", _SKEW, *_BOTH, *(name for pair in _PAIRS for name in pair))
-_INSTEAD = "A lens with distortion is told by a calibration file (ingest.calibration)"
+_INSTEAD = "Describe a lens with distortion in a calibration file (ingest.calibration)"
 
 
 def check_described(

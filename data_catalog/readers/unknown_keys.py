@@ -61,7 +61,7 @@ def warn_of_unknown_keys(
     more = f"; and {len(unknown) - _NAMED_KEYS} more" if len(unknown) > _NAMED_KEYS else ""
     misspelt = next((key for key in unknown if key.similarity >= _LIKELY), None)
     logger.warning(
-        "%s: keys that are not known here are passed over: %s%s",
+        "%s: unknown keys are ignored: %s%s",
         file,
         told,
         more,

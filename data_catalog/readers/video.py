@@ -162,8 +162,9 @@ class VideoFile:
                 if clock.is_broken and not self._is_break_told:
                     self._is_break_told = True
                     logger.warning(
-                        "%s: the timestamps of frame %d do not go on from those before, as where recordings "
-                        "were joined; times (ingest.start_s, ingest.end_s) count on, frame by frame",
+                        "%s: the timestamps of frame %d do not continue from those before, as where "
+                        "recordings were joined; times (ingest.start_s, ingest.end_s) count on, frame by "
+                        "frame",
                         self._file,
                         number,
                     )

@@ -54,8 +54,8 @@ class LightConfig(StageConfig):
         0.055,
         ge=0,
         le=1,
-        description="what black has to show, in the mean of the colours, for glare to be kept; less is found "
-        "where there is none as well, and bends the fall-off",
+        description="glare is kept where black is at least this bright, in the mean of the colours; less is "
+        "also found where there is no glare, and distorts the fall-off",
     )
     exposure_learning_rate: float = Field(0.005, gt=0, description="of the exposure per frame")
     exposure_prior: float = Field(

@@ -67,7 +67,7 @@ class IngestConfig(StageConfig):
         ge=20,
         le=80,
         description="what frames that are shrunk and enlarged again must keep, as the PSNR against "
-        "themselves; sets the size where size is detail, and is told of all sources",
+        "themselves; sets the size where size is detail, and what it would give is reported for every source",
     )
     holdout_every: int = Field(
         8, ge=2, description="hold out every n-th frame where the source defines no split"
@@ -108,8 +108,8 @@ class IngestConfig(StageConfig):
     )
     stereo_camera: StereoCamera = Field(
         "left",
-        description="of frames and videos of a stereo endoscope: whose are read. Refused where nothing tells "
-        "of two cameras, unless it is left; its choice counts in cache keys where it is right",
+        description="which camera's frames are read of a stereo endoscope. right is refused where nothing "
+        "indicates two cameras, and is part of cache keys",
     )
     field_of_view_deg: float | None = Field(
         None,
@@ -141,7 +141,7 @@ class AssessConfig(StageConfig):
         192,
         ge=1,
         description="views in the fan round the training views; with few of them what is found lacking, and "
-        "with it the plan, hangs on the seed",
+        "with it the plan, depends on the seed",
     )
     probe_offset: float = Field(0.35, gt=0, description="sideways offset of a probe, in median depths")
     probe_turn_deg: float = Field(35.0, ge=0, description="turn of a probe")
@@ -197,9 +197,9 @@ class EvaluateConfig(StageConfig):
         "refined",
         description="held-out views of the final scene are also measured after restoration in the image. "
         "textured: what is invented gets texture of the scene's own frames, which looks right and costs some "
-        "PSNR; refined: a network makes that texture and the shapes agree, unless the leave-out frames speak "
-        "against networks; smooth: without either; none: not measured. Each held-out view takes the restorer "
-        "once, which a large pretrained model makes long",
+        "PSNR; refined: a network makes that texture and the shapes agree, unless on leave-out frames "
+        "networks do worse than without; smooth: without either; none: not measured. Each held-out view "
+        "takes the restorer once, which a large pretrained model makes long",
     )
 
     @field_validator("lpips_nets")

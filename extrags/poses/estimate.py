@@ -209,7 +209,7 @@ def _check_possible(sequence: EndoscopicSequence, config: PosesConfig) -> None:
     if of_given_poses and sequence.depth_mm is None and config.working_distance_mm is None:
         raise ConfigError(
             f"{sequence.name}: ingest.scale_mm_per_unit is the unit of the source's poses, and "
-            "poses.replace_given estimates others, whose unit it says nothing of; leave it out, or give "
+            "poses.replace_given estimates others, to which it does not apply; leave it out, or give "
             "poses.working_distance_mm instead"
         )
     if len(sequence.train) < MIN_TRAINING_FRAMES:

@@ -97,7 +97,7 @@ def _head(title: str, command: str, made: str) -> str:
     fence = "`" * max([3, *(len(found) + 1 for found in re.findall("`+", command))])
     return (
         f"# {title}\n\nMade by{f' {made}' if made else ''}\n\n{fence}bash\n{command}\n{fence}\n\n"
-        "Of each run stand here the held-out view whose PSNR is the median of all, and the middle one of its "
+        "Each run is shown by the held-out view whose PSNR is the median of all, and the middle one of its "
         "virtual views: none is picked by its looks. Figures below an image are those of this view alone. "
         "Unless said otherwise, no stage has seen the held-out frames. Cyan in *never observed* is surface "
         "that no training frame saw: what the scenes show there is invented.\n"

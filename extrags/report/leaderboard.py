@@ -144,8 +144,8 @@ def _warnings(rows: Sequence[BoardRow]) -> list[str]:
         unknown = " and of earlier ones that are not on record" if None in protocols else ""
         found.append(
             f"Figures are of several versions of the evaluation protocol ({known}{unknown}): some of them "
-            "cannot be compared. Runs of the older ones, started again, are measured anew without being made "
-            "anew."
+            "cannot be compared. Start the older runs again to measure them again; nothing else is "
+            "recomputed."
         )
     if unlike := _unlike_seeds(rows):
         found.append(
@@ -154,8 +154,8 @@ def _warnings(rows: Sequence[BoardRow]) -> list[str]:
         )
     if len({row.further for row in rows}) > 1:
         found.append(
-            "Not all runs had the same further settings: they stand with each in the list of all runs, and "
-            "the tables before it do not tell them apart."
+            "Not all runs had the same further settings: the list of all runs gives those of each, and the "
+            "tables before it do not distinguish them."
         )
     return found
 

@@ -306,7 +306,7 @@ class Store:
             ) from error
         if place is not None:
             log.warning(
-                "stage %s: artefact %s is damaged (%s); it is set aside as %s and made anew when needed",
+                "stage %s: artefact %s is damaged (%s); it is set aside as %s and recomputed when needed",
                 damage.stage,
                 damage.key,
                 f"{damage.file}: {damage.problem}" if damage.file else damage.problem,
@@ -450,7 +450,7 @@ class Store:
             except StoreError as error:
                 if "://" in self.root and not isinstance(error, DamagedArtefactError):
                     raise
-                log.warning("%s is passed over: %s", key, error)
+                log.warning("%s is skipped: %s", key, error)
                 unreadable.append(key)
             else:
                 found += [] if manifest is None else [manifest]

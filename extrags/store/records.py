@@ -88,7 +88,7 @@ def read_records(
 
 
 def _pass_over(store: Store, name: str, reason: str) -> None:
-    log.warning("the record %s of %s is damaged and passed over: %s", name, store.root, reason)
+    log.warning("the record %s of %s is damaged and skipped: %s", name, store.root, reason)
 
 
 def remove_record(store: Store, name: str) -> None:

@@ -68,7 +68,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument(
         "--refresh",
         action="store_true",
-        help="make everything anew, so that times are those of now, and add them to the history in the store",
+        help="recompute everything, so that times are those of now, and add them to the history in the store",
     )
     parser.add_argument(
         "--max-psnr-loss",

@@ -48,7 +48,7 @@ def add_arguments(parser: Parser) -> None:
         "all of them. Exit code 1 when an artefact is damaged.",
     )
     made.add_argument(
-        "--repair", action="store_true", help="set damaged artefacts aside; the next run makes them anew"
+        "--repair", action="store_true", help="set damaged artefacts aside; the next run recomputes them"
     )
     add_store(made)
     add_json(made)
@@ -163,9 +163,9 @@ def verify(given: argparse.Namespace) -> int:
             # They may be whole: whoever may read them can tell.
             out.print(f"{counted(len(unreadable), 'artefact')} could not be read", markup=False)
         if damaged and not given.repair:
-            out.print("with --repair they are set aside, and the next run makes them anew")
+            out.print("with --repair they are set aside, and the next run recomputes them")
         elif damaged:
-            out.print("the next run makes them anew; `extrags cache gc` removes what was set aside")
+            out.print("the next run recomputes them; `extrags cache gc` removes what was set aside")
     rows = [
         {
             "stage": damage.stage,

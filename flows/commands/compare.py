@@ -19,7 +19,7 @@ def add_arguments(parser: Parser) -> None:
     from flows.methods import METHODS
 
     parser.description = (
-        "Make a page that holds finished runs of one sequence against each other: figures with their "
+        "Make a page that compares finished runs of one sequence side by side: figures with their "
         "differences to the first, the same held-out views, settings that differ. Nothing is run."
     )
     parser.set_defaults(command=compare)

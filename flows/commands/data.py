@@ -190,7 +190,7 @@ def _print_inspection(out: Console, found: Inspection) -> None:
     from rich.markup import escape
 
     form = "" if found.format is None else f" ({found.format})"
-    state = "[green]nothing is wrong[/]" if found.ok else f"[red]{len(found.findings)} found[/]"
+    state = "[green]nothing is wrong[/]" if found.ok else f"[red]{counted(len(found.findings), 'problem')}[/]"
     out.print(f"[bold]{escape(found.name)}[/]{form}: {state}")
     if found.conventions:
         out.print(f"  read as: {escape(found.conventions)}", soft_wrap=True)

@@ -44,7 +44,7 @@ def add_arguments(parser: Parser) -> None:
         "--depth", metavar="FOLDER", help="z-depth of the same frames: .npy, or 16-bit PNG or TIFF; 0: none"
     )
     parser.add_argument(
-        "--depth-step", type=float, metavar="MM", help="what one level of an integer depth image stands for"
+        "--depth-step", type=float, metavar="MM", help="depth of one level of an integer depth image"
     )
     add_method(parser)
     add_json(parser)

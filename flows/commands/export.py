@@ -135,7 +135,7 @@ def add_arguments(parser: Parser) -> None:
         "--panels",
         metavar="PANEL,...",
         help="pictures of a video side by side: coarse, final, uncertainty (default: all, without coarse "
-        "where nothing was fine-tuned); uncertainty stands last",
+        "where nothing was fine-tuned); uncertainty comes last",
     )
 
 
@@ -180,7 +180,7 @@ def _check(given: argparse.Namespace) -> None:
     for name, targets in APPLIES.items():
         if getattr(given, name) is not None and given.to not in targets:
             flag = "--no-texture" if name == "texture" else f"--{name.replace('_', '-')}"
-            raise ConfigError(f"{flag} says nothing about --to {given.to}; it is for {', '.join(targets)}")
+            raise ConfigError(f"{flag} does not apply to --to {given.to}; it is for {', '.join(targets)}")
     if given.light == "kept" and given.to != "ply":
         raise ConfigError(f"--light kept is for --to ply; {given.to} has no place for a light")
     if given.light == "kept" and given.exposure is not None:

@@ -119,13 +119,13 @@ def run(given: argparse.Namespace) -> int:
             "the following arguments are required: SEQUENCE or --manifest FILE (see extrags run --help)"
         )
     if given.seeds and given.seed is not None:
-        raise ConfigError("--seeds stands in place of --seed: give one of the two")
+        raise ConfigError("--seeds replaces --seed: give one of the two")
     if given.methods and getattr(given, "said_method", False):
-        raise ConfigError("--methods stands in place of --method: give one of the two")
+        raise ConfigError("--methods replaces --method: give one of the two")
     matrix = parsed_matrix(given.matrix)
     for name in matrix:
         if name in getattr(given, "said_settings", {}):
-            raise ConfigError(f"--matrix {name} stands in place of --{name} and --set: give one of them")
+            raise ConfigError(f"--matrix {name} replaces --{name} and --set: give one of them")
     begun = time.monotonic()
     outcome = execute(
         sequences,

@@ -129,7 +129,7 @@ def _check(given: argparse.Namespace) -> None:
         for name in ("scene", "seed", "settings"):
             if getattr(given, name) not in (None, {}):
                 flag = f"--{name}" if name != "settings" else ", ".join(f"--{key}" for key in given.settings)
-                raise ConfigError(f"{flag} says nothing about a file of Gaussians; it is for a SEQUENCE")
+                raise ConfigError(f"{flag} does not apply to a file of Gaussians; it is for a SEQUENCE")
 
 
 def _device(asked: str) -> str:

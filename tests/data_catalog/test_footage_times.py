@@ -87,7 +87,7 @@ class TestJoined:
         for _ in range(2):
             times_s = [frame.time_s for frame in video.frames(TimeSpan())]
             assert times_s == pytest.approx(np.arange(50) / 25, abs=1e-3)
-        assert caplog.text.count("the timestamps of frame 20 do not go on from those before") == 1
+        assert caplog.text.count("the timestamps of frame 20 do not continue from those before") == 1
         later = [frame.number for frame in video.frames(TimeSpan(1.0, 1.4))]
         assert later == list(range(25, 35))
 

@@ -144,7 +144,7 @@ class TestNumbering:
             (
                 [f"{s}.{k:03d}" for s in (1, 2) for k in range(12)],
                 "series of frames",
-                "the numbering begins anew",
+                "the numbering starts over",
             ),
         ],
     )

@@ -84,7 +84,7 @@ class TestOtherEntries:
         with caplog.at_level(logging.WARNING):
             stated(unit="normalized", _note="of Monday", distortion=[0, 0])
         (said,) = caplog.messages
-        assert said.endswith("keys that are not known here are passed over: 'unit'")
+        assert said.endswith("unknown keys are ignored: 'unit'")
 
     def test_what_is_misspelt_is_a_finding(self, tmp_path) -> None:
         texture = np.random.default_rng(0).integers(40, 255, (HEIGHT, WIDTH + 8, 3)).astype(np.uint8)

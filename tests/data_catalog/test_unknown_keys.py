@@ -22,7 +22,7 @@ def told(caplog: pytest.LogCaptureFixture):
         caplog.clear()
         with caplog.at_level(logging.WARNING):
             read(folder)
-        return [message for message in caplog.messages if "not known here" in message]
+        return [message for message in caplog.messages if "unknown keys" in message]
 
     return reading
 
@@ -47,7 +47,7 @@ class TestPosesJson:
     def test_beside_the_frames(self, posed_folder, edit_poses, told, key, near) -> None:
         edit_poses(lambda content: content.update({key: 3}))
         (said,) = told(posed_folder)
-        assert said == f"{posed_folder / 'poses.json'}: keys that are not known here are passed over: {near}"
+        assert said == f"{posed_folder / 'poses.json'}: unknown keys are ignored: {near}"
 
     def test_in_frames_is_said_once(self, posed_folder, edit_poses, told) -> None:
         def misspelt(content) -> None:

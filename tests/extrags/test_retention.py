@@ -370,7 +370,7 @@ def test_a_manifest_that_cannot_be_read_hinders_no_other(
     assert planned(chain, older_than_s=15 * DAY_S) == []
     done = apply_policy(chain, Policy(older_than_s=5 * DAY_S))
     assert (names(done.removed), done.skipped) == (["report", "coarse", "ingest"], ["other-v1-00"])
-    assert "other-v1-00 is passed over: " in caplog.text
+    assert "other-v1-00 is skipped: " in caplog.text
     assert [row.artefacts for row in usage(chain)] == []
 
 

@@ -442,7 +442,7 @@ class TestSetAside:
             store.examine(KEY)
         caplog.clear()
         assert store.ls() == []
-        assert f"{KEY} is passed over" in caplog.text
+        assert f"{KEY} is skipped" in caplog.text
         assert store.rm("*") == []
         assert f"{KEY} is left: " in caplog.text
         assert store.rm(KEY) == [KEY]

@@ -84,8 +84,8 @@ class TestRecords:
             write_record(store, name, record)
         assert read_records(store, shape=Shape) == {"a": {"n": 2, "more": "x"}}
         assert "b.json of" in caplog.text
-        assert "is damaged and passed over: n: Field required" in caplog.text
-        assert "is damaged and passed over: rows.0.k: Input should be" in caplog.text
+        assert "is damaged and skipped: n: Field required" in caplog.text
+        assert "is damaged and skipped: rows.0.k: Input should be" in caplog.text
 
     def test_one_that_cannot_be_read_is_not_taken_for_gone(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -159,8 +159,8 @@ class TestCheck:
             folder.mkdir()
         assert main(["data", "check", *map(str, folders)]) == 1
         assert told[0] == ""
-        assert "first: 1 found" in told[1]
-        assert "second: 1 found" in capsys.readouterr().out
+        assert "first: 1 problem" in told[1]
+        assert "second: 1 problem" in capsys.readouterr().out
 
     def test_as_json(self, scene: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         (tmp_path / "poses.json").write_text("{")

@@ -109,7 +109,7 @@ def test_a_killed_run_is_crashed_at_the_next_start_and_the_living_are_left_alone
         assert run.state_type == StateType.CRASHED
         assert run.state is not None
         assert run.state.message == (
-            "Ended without a word: its process is gone. What was finished is in the store; a new run resumes "
+            "Ended unexpectedly: its process is gone. What was finished is in the store; a new run resumes "
             "there."
         )
         assert task_states(dead) == {StateType.CRASHED}

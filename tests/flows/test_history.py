@@ -219,7 +219,7 @@ class TestRecords:
         name = append_history(store, whole)
         write_record(store, name, damaged)
         assert [item["when"][:10] for item in history_of(store, "weekly")] == ["2026-01-01"]
-        assert f"{name}.json of {store.root} is damaged and passed over" in caplog.text
+        assert f"{name}.json of {store.root} is damaged and skipped" in caplog.text
 
     def test_names_of_any_length_are_told_apart(self, tmp_path: Path) -> None:
         store = Store(tmp_path)

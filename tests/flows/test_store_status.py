@@ -79,7 +79,7 @@ def test_a_damaged_record_hides_no_other(
     store.backend.write_record("outcome.damaged.json", json.dumps(record).encode())
     (row,) = store_status(store).rows
     assert (row.sequence, row.state) == (SEQUENCE, "done")
-    assert f"the record outcome.damaged.json of {store.root} is damaged and passed over" in caplog.text
+    assert f"the record outcome.damaged.json of {store.root} is damaged and skipped" in caplog.text
     (found,) = expectations([CASE], store.root, "report")
     assert found.seconds == 0
     assert selected([CASE], "failed", store.root, "report") == []

@@ -85,9 +85,9 @@ class TestRefused:
         [
             (["phantom/0@sparse", "--width", "8"], "--width is 8; expected 16 to 8192"),
             (["phantom/0@sparse", "--port", "70000"], "--port is 70000; expected 0 to 65535"),
-            (["a.ply", "--scene", "coarse"], "--scene says nothing about a file of Gaussians"),
-            (["a.spz", "--seed", "1"], "--seed says nothing about a file of Gaussians"),
-            (["a.ply", "--coarse.iterations", "5"], "--coarse.iterations says nothing about a file"),
+            (["a.ply", "--scene", "coarse"], "--scene does not apply to a file of Gaussians"),
+            (["a.spz", "--seed", "1"], "--seed does not apply to a file of Gaussians"),
+            (["a.ply", "--coarse.iterations", "5"], "--coarse.iterations does not apply to a file"),
             (["phantom/0@sparse", "--scene", "fine"], "invalid choice: 'fine'"),
             (["phantom/0@sparse", "--method", "uc-nerf"], "uc-nerf makes no Gaussians"),
         ],
