@@ -29,6 +29,7 @@ __all__ = [
     "BACKBONES",
     "BACKBONES_URL",
     "WEIGHTS_VARIABLE",
+    "absent_parts",
     "check_weights",
     "download_backbone",
     "find_heads",
@@ -66,7 +67,7 @@ def find_weights(explicit: str | None = None, net: LpipsNet = "alex") -> tuple[P
         net: backbone.
 
     Raises:
-        WeightsError: when there is none, with how to get them; or a file is not what its name says.
+        WeightsError: when there is none, with the command that helps; or a file is not what its name says.
         ConfigError: for an unknown network.
     """
     if net not in LAYERS:
@@ -95,16 +96,36 @@ def find_weights(explicit: str | None = None, net: LpipsNet = "alex") -> tuple[P
     if heads is not None and backbone.is_file():
         _check_digest(backbone)
         return (heads, backbone)
+    raise WeightsError(
+        f"no LPIPS weights for {net}; `extrags weights lpips` says which files are missing, and with "
+        "--download gets the backbone"
+    )
+
+
+def absent_parts(net: LpipsNet) -> str:
+    """What is missing where no weights of a backbone are found, place by place, and how to get it.
+
+    Args:
+        net: backbone.
+
+    Returns:
+        Empty where weights are in one of the places that are always searched.
+    """
+    filename = f"lpips_{net}_v0.1.npz"
+    heads, backbone = find_heads(net), _backbone_path(net)
+    folders = weights_roots("lpips")
+    if (heads is not None and backbone.is_file()) or any((folder / filename).is_file() for folder in folders):
+        return ""
     parts = [
         *(f"no {folder / filename}" for folder in folders),
         *([] if heads is not None else [f"no package with the heads ({installed_with('lpips')})"]),
         *([] if backbone.is_file() else [f"no {backbone} (extrags weights lpips --download)"]),
     ]
-    raise WeightsError(
-        f"no LPIPS weights for {net}: there is {' and '.join(parts)}. Get what is missing, or "
-        "convert the published LPIPS v0.1 weights to npz (features.N.weight, features.N.bias, lin0, lin1, "
-        "...) and put the file there, or name it, or the folder that holds it, in "
-        f"{WEIGHTS_VARIABLE} or evaluate.lpips_weights"
+    return (
+        f"no LPIPS weights for {net}: there is {' and '.join(parts)}. Get heads and backbone, or convert the "
+        "published LPIPS v0.1 weights to npz (features.N.weight, features.N.bias, lin0, lin1, ...) and put "
+        f"the file there, or name it, or the folder that holds it, in {WEIGHTS_VARIABLE} or "
+        "evaluate.lpips_weights"
     )
 
 

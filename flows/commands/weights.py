@@ -50,6 +50,7 @@ def lpips(given: argparse.Namespace) -> int:
     from extrags.errors import WeightsError
     from extrags.metrics.lpips_weights import (
         WEIGHTS_VARIABLE,
+        absent_parts,
         check_weights,
         download_backbone,
         find_heads,
@@ -68,7 +69,7 @@ def lpips(given: argparse.Namespace) -> int:
         except WeightsError as error:
             # Without heads a backbone is of no use.
             if not given.download or not elsewhere or find_heads(net) is None:
-                case["missing"] = str(error)
+                case["missing"] = (absent_parts(net) if elsewhere else "") or str(error)
                 continue
             download_backbone(net)
             files = find_weights(None, net)

@@ -57,7 +57,7 @@ def scene_restorer(
     found = _judged_restorer(scene, sequence, config, coarse)
     # Of the one that serves: of two sets of weights the judge may prefer the less familiar one.
     if isinstance(found, EmbeddedEnhancer | ClassicalEnhancer):
-        _tell_domain(found.domain_score)
+        _tell_domain(found)
     return found
 
 
@@ -97,8 +97,10 @@ def _judged_restorer(
 
 def _why_unjudged(sequence: EndoscopicSequence, config: EnhanceConfig) -> str | None:
     """Why no training frames can be left out; None where some can be."""
-    if len(sequence.train) < MIN_FRAMES:
-        return f"{len(sequence.train)} training frames are too few to leave some out"
+    count = len(sequence.train)
+    if count < MIN_FRAMES:
+        frames = "1 training frame is" if count == 1 else f"{count} training frames are"
+        return f"{frames} too few to leave some out"
     if not usable_folds(sequence, config):
         return "no training frame with a valid pixel can be left out"
     return None
@@ -247,7 +249,7 @@ def _cloning_outside(enhancer: EmbeddedEnhancer, reason: str, cloning: SeamlessC
 
     Args:
         enhancer: ready for the scene.
-        reason: why it is not judged, for the log and the artefact.
+        reason: why it is not judged, for the artefact.
         cloning: as in the settings.
     """
     score = enhancer.domain_score
@@ -257,20 +259,24 @@ def _cloning_outside(enhancer: EmbeddedEnhancer, reason: str, cloning: SeamlessC
         f"{reason}, and this scene is unlike what the embedded restorer was trained on ({score:.1f} times "
         "as far as unseen scenes of that kind are)"
     )
-    logger.warning("%s; what it invents is cloned seamlessly into what is known", reason)
     found = enhancer.cloning_seamlessly()
     return replace(found, record={**found.record, "unjudged": reason})
 
 
-def _tell_domain(score: float | None) -> None:
+def _tell_domain(restorer: EmbeddedEnhancer | ClassicalEnhancer) -> None:
+    """Say where a scene is unlike the training data, and what follows where nothing judges the restorer."""
+    score = restorer.domain_score
     if score is None:
         return
     emit(MetricRecorded("enhance", "domain_score", score))
     if score > 1:
         logger.warning(
             "this scene is unlike what the restorer was trained on (%.1f times as far as unseen scenes of "
-            "that kind are)",
+            "that kind are)%s",
             score,
+            "; what it invents is cloned seamlessly into what is known"
+            if isinstance(restorer, EmbeddedEnhancer) and "unjudged" in restorer.record
+            else "",
         )
 
 

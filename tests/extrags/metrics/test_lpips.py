@@ -19,6 +19,7 @@ from extrags.metrics import lpips_weights as weights_module
 from extrags.metrics.lpips import Lpips, TargetActivations, available_lpips
 from extrags.metrics.lpips_weights import (
     WEIGHTS_VARIABLE,
+    absent_parts,
     check_weights,
     download_backbone,
     find_weights,
@@ -164,8 +165,10 @@ def test_search_order(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
-    with pytest.raises(WeightsError, match=r"no .*/data/extrags/lpips/lpips_alex_v0\.1\.npz and no "):
+    with pytest.raises(WeightsError, match="no LPIPS weights for alex"):
         find_weights(None, "alex")
+    absent = absent_parts("alex")
+    assert f"no {tmp_path / 'data' / 'extrags' / 'lpips' / 'lpips_alex_v0.1.npz'} and no " in absent
 
     cached = tmp_path / "cache" / "extrags" / "lpips" / "lpips_alex_v0.1.npz"
     in_data = tmp_path / "data" / "extrags" / "lpips" / "lpips_alex_v0.1.npz"
@@ -259,12 +262,15 @@ class TestPytorchsFiles:
         self, net: LpipsNet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         weights, made, cached = as_pytorch_has_it(net, tmp_path, monkeypatch)
-        with pytest.raises(WeightsError, match=r"no .*checkpoints.*extrags weights lpips --download"):
+        with pytest.raises(WeightsError, match=r"no LPIPS weights for \w+; `extrags weights lpips`"):
             find_weights(None, net)
+        assert f"there is no {tmp_path}" in absent_parts(net)
+        assert f"no {cached} (extrags weights lpips --download)" in absent_parts(net)
         cached.parent.mkdir(parents=True)
         made.rename(cached)
         files = find_weights(None, net)
         assert [file.name for file in files] == [f"{net}.pth", cached.name]
+        assert absent_parts(net) == ""
         np.savez(tmp_path / "one.npz", **{name: value.numpy() for name, value in weights.items()})
         read, expected = read_weights(files, net), read_weights((tmp_path / "one.npz",), net)
         assert read.keys() == expected.keys()
@@ -288,8 +294,9 @@ class TestPytorchsFiles:
     def test_without_heads(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         as_pytorch_has_it("alex", tmp_path, monkeypatch)
         monkeypatch.setattr(weights_module, "find_spec", lambda name: None)
-        with pytest.raises(WeightsError, match=r"pip install -e '\.\[lpips\]'"):
+        with pytest.raises(WeightsError, match="no LPIPS weights for alex"):
             find_weights(None, "alex")
+        assert "pip install -e '.[lpips]'" in absent_parts("alex")
 
     def test_heads_of_torchmetrics_are_those_of_the_npz_file(self, weights_folder: Path) -> None:
         pytest.importorskip("torchmetrics")

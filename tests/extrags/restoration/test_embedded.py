@@ -326,6 +326,7 @@ class TestEmbedded:
         tmp_path: Path,
         trained: EmbeddedEnhancer,
         monkeypatch,
+        caplog: pytest.LogCaptureFixture,
         limit: float,
         cloning: str,
         seamless: bool,
@@ -340,6 +341,9 @@ class TestEmbedded:
         assert isinstance(served, EmbeddedEnhancer)
         assert served.record["scene_training_kept"] is False
         assert served.seamless == seamless
+        said = [message for message in caplog.messages if "unlike" in message or "cloned" in message]
+        assert len(said) == int(limit < 1)
+        assert all(("cloned seamlessly" in message) == seamless for message in said)
 
     def test_a_restorer_saved_for_a_scene_gives_another_one_its_weights_alone(
         self, tube: Tube, tmp_path: Path, trained: EmbeddedEnhancer
