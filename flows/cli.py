@@ -44,7 +44,7 @@ VERBS = {
     "evaluate": "measure renders made elsewhere, or show the figures of a finished run",
     "benchmark": "compare methods over sequences and seeds",
     "bench": "measure speed and error of the parts or of the whole",
-    "pretrain": "make the restorer's weights anew from procedural scenes",
+    "pretrain": "train the restorer's weights from the beginning, on procedural scenes",
     "completion": "a script that completes commands, options, settings and sequences in a shell",
 }
 """Each verb with what it does, in the order of the help."""

@@ -341,7 +341,7 @@ def _times_s(header: Any, count: int, file: Path) -> Float[np.ndarray, "f"]:
         if value:
             return np.arange(count) * (value if name == "FrameTime" else 1000 / value) / 1000
     logger.warning(
-        "%s tells no timing: assuming %g frames a second, by which ingest.start_s, ingest.end_s and the "
+        "%s has no timing: assuming %g frames a second, by which ingest.start_s, ingest.end_s and the "
         "lengths of shots go",
         file.name,
         _USUAL_FRAMES_PER_S,

@@ -41,7 +41,7 @@ class FinetuneConfig(StageConfig):
     rounds: int = Field(
         1,
         ge=1,
-        description="with virtual views, how often the steps begin anew: from the second round on these show "
+        description="with virtual views, how often the steps start over: from the second round on these show "
         "what was restored mixed with what the scene has become, and holes that are left are filled",
     )
     known_share: float = Field(
@@ -49,14 +49,14 @@ class FinetuneConfig(StageConfig):
         ge=0,
         le=1,
         description="in further rounds: of the restored view, where the coarse scene knows the surface; less "
-        "where left-out frames tell that less serves",
+        "where left-out frames show that less is better",
     )
     invented_share: float = Field(
         0.6,
         ge=0,
         le=1,
         description="in further rounds: of the restored view, where it is invented; less where left-out "
-        "frames tell that less serves",
+        "frames show that less is better",
     )
     densify_share: float = Field(0.6, ge=0, le=1, description="densification ends at this share")
     pseudo_share: float = Field(

@@ -27,7 +27,8 @@ def add_arguments(parser: Parser) -> None:
     """Options of `extrags bench stability`."""
     parser.description = (
         "Run every part of the computation on inputs at the edges of what it can be given, compare with "
-        "float64 and with what must not change, and tell the worst case of each. Exit code 1 if a row fails."
+        "float64 and with what must not change, and report the worst case of each. Exit code 1 if a row "
+        "fails."
     )
     parser.add_argument(
         "--rows", nargs="+", default=["*"], metavar="PATTERN", help="these rows only (default: all)"

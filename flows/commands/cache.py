@@ -29,7 +29,7 @@ BYTES = {"": 1, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30, "TiB": 2**40}
 
 def add_arguments(parser: Parser) -> None:
     """The verbs below `extrags cache`."""
-    parser.description = "Look into the artefact store and clean it."
+    parser.description = "List, verify and clean the artefact store."
     verbs = parser.add_subparsers(metavar="ls|usage|verify|rm|gc", required=True, parser_class=Parser)
     made = add_verb(verbs, "ls", ls, "list artefacts")
     made.add_argument("pattern", nargs="?", default="*", help="shell pattern over key, stage or sequence")

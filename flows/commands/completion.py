@@ -28,7 +28,7 @@ def add_arguments(parser: Parser) -> None:
     """The options of `extrags completion`."""
     parser.description = (
         "Print a script that completes verbs, options, settings with their values, and names of sequences. "
-        "It holds all of them as they are now, and starts no Python: make it anew after an update. It goes "
+        "It holds all of them as they are now, and starts no Python: print it again after an update. It goes "
         "into ~/.local/share/bash-completion/completions/extrags for bash, into a file _extrags in a folder "
         "of $fpath for zsh, and into ~/.config/fish/completions/extrags.fish for fish."
     )

@@ -65,7 +65,7 @@ class Parser(argparse.ArgumentParser):
             "--quiet",
             action="store_true",
             default=argparse.SUPPRESS,
-            help="say nothing but errors, and what was asked for on standard output",
+            help="print only errors, and what was asked for on standard output",
         )
 
     def format_help(self) -> str:

@@ -130,7 +130,7 @@ def _deployment(declared: Declared, *, schedules: bool) -> Any:
 
     if declared.unserved:
         raise declared.error(
-            f"extrags serve cannot go by {', '.join(declared.unserved)}; use a work pool, or leave it out"
+            f"extrags serve does not support {', '.join(declared.unserved)}; use a work pool, or leave it out"
         )
     for name, value in declared.environment.items():
         if os.environ.get(name) != value:

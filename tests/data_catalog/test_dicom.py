@@ -87,11 +87,11 @@ class TestPixels:
         ("elements", "last_s", "told"),
         [
             ({"FrameTime": 50}, 0.55, []),
-            ({}, 0.44, ["a.dcm tells no timing: assuming 25 frames a second"]),
+            ({}, 0.44, ["a.dcm has no timing: assuming 25 frames a second"]),
             (
                 {"FrameTimeVector": [0, 100, 100]},
                 0.44,
-                ["FrameTimeVector has 3 entries for 12 frames", "tells no timing: assuming 25"],
+                ["FrameTimeVector has 3 entries for 12 frames", "has no timing: assuming 25"],
             ),
             (
                 {"FrameTimeVector": [0, 100, 100], "FrameTime": 50},
