@@ -171,7 +171,7 @@ def estimate_depth(
         raise CaptureError(f"{sequence.name}: depth from other frames needs at least two, found one")
     poses = PROFILES[DEFAULT_PROFILE].poses if poses is None else poses
     points, points_rgb, origin = _points(sequence, config, poses)
-    small = sequence.at_most_width(config.max_width)
+    small = _with_masks(sequence.at_most_width(config.max_width))
     near, typical, far = _ranges(small, points, config)
     frames = posed_frames(small, device)
     sources = _sources(small, typical, config).to(device)
@@ -212,6 +212,28 @@ def estimate_depth(
         "median_expected_error": _median_error(expected, sequence.mask),
     }
     return DepthEstimate(depth, expected, points.astype(np.float64), points_rgb, report)
+
+
+def _with_masks(small: EndoscopicSequence) -> EndoscopicSequence:
+    """Frames in the size they are matched at; of a mask too fine for it, all of the picture.
+
+    Without a pixel a frame has no typical depth, and its depth would be made of nothing.
+    """
+    lost = [index for index, mask in enumerate(small.mask) if not mask.any()]
+    if not lost:
+        return small
+    _LOG.warning(
+        "%s: at a width of %d px the masks of %d of %d frames, %s first, leave no pixel that shows tissue "
+        "throughout: these frames are matched as a whole (depth.max_width)",
+        small.name,
+        small.width,
+        len(lost),
+        len(small),
+        small.frame_name(lost[0]),
+    )
+    masks = np.array(small.mask)
+    masks[lost] = True
+    return replace(small, mask=masks)
 
 
 def _with_measured(estimate: DepthEstimate, sequence: EndoscopicSequence) -> DepthEstimate:

@@ -131,9 +131,13 @@ def reading_size(size: Sequence[int], longest: int) -> tuple[int, int]:
     return height, width
 
 
-def shrunk(image: Float[Tensor, "t c h w"], size: tuple[int, int]) -> Float[Tensor, "t c h2 w2"]:
+def shrunk(image: Float[Tensor, "t c h w"], size: Sequence[int]) -> Float[Tensor, "t c h2 w2"]:
     """Images as means over areas, of another height and width; as they are where they have it."""
-    return image if image.shape[-2:] == size else functional.interpolate(image, size, mode="area")
+    return (
+        image
+        if tuple(image.shape[-2:]) == tuple(size)
+        else functional.interpolate(image, list(size), mode="area")
+    )
 
 
 def shrunk_intrinsics(

@@ -49,3 +49,18 @@ def test_without_shading_light_tells_the_network_nothing(
     estimate.estimate_depth(sequence, DepthConfig(hypotheses=24, sources=3, shading=shading))
     assert shown
     assert all(bool(torch.isfinite(scatter).all()) == shading for scatter in shown)
+
+
+def test_a_mask_that_is_too_fine_for_the_smaller_size_leaves_no_frame_without_depth(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    sequence = with_points(withheld_phantom(5, width=64, height=48)).training_part()
+    masks = np.array(sequence.mask)
+    masks[1] &= np.arange(64) % 3 == 0
+    striped = replace(sequence, mask=masks)
+    settings = DepthConfig(hypotheses=24, sources=3, max_width=32)
+    whole, found = (estimate.estimate_depth(given, settings) for given in (sequence, striped))
+    assert "masks of 1 of 5 frames" in caplog.text
+    ratio = found.depth[1][masks[1]] / whole.depth[1][masks[1]]
+    assert 0.9 < np.median(ratio) < 1.1
+    assert not found.depth[1][~masks[1]].any()
