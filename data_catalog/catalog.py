@@ -31,9 +31,8 @@ from data_catalog.stereo import check_one_camera
 from extrags.arguments import check_settings_argument
 from extrags.config import DEFAULT_PROFILE, PROFILES, IngestConfig
 from extrags.errors import ConfigError, SourceError, SourceNotFoundError, UnknownSequenceError
-from extrags.measured_depth import with_depth_error
+from extrags.reading_corrections import with_corrections
 from extrags.redaction import without_credentials
-from extrags.scarce_depth import without_scarce_depth
 from extrags.sequence import EndoscopicSequence
 from extrags.user_paths import expanded
 
@@ -172,8 +171,7 @@ def read(source: Source | str | Path, config: IngestConfig | None = None) -> End
     # After the checks, which hold poses against all depth there is; what was observed is known by now.
     if config.withhold_depth:
         sequence = sequence.without_training_depth()
-    elif sequence.world_from_camera is not None:
-        sequence = with_depth_error(without_scarce_depth(sequence), config.depth_error)
+    sequence = with_corrections(sequence, config)
     return with_specular(sequence)
 
 

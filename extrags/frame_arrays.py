@@ -11,8 +11,7 @@ from jaxtyping import Bool, Float, Real, UInt8
 from extrags.errors import ConfigError, ShapeError, SourceError
 from extrags.frame_stacks import stacked
 from extrags.known_depth import is_background
-from extrags.measured_depth import with_depth_error
-from extrags.scarce_depth import without_scarce_depth
+from extrags.reading_corrections import with_corrections
 from extrags.sequence import EndoscopicSequence
 from extrags.sequence_checks import check_arrays, check_pose
 from extrags.splits import Split, every_nth
@@ -101,9 +100,7 @@ def sequence_from_arrays(
         raise SourceError(
             "no pixel of any frame has a depth; pass None where none is known", field="depth_mm"
         )
-    if sequence.world_from_camera is None:
-        return sequence
-    return with_depth_error(without_scarce_depth(sequence))
+    return with_corrections(sequence)
 
 
 def _as_bytes(rgb: np.ndarray, labels: Sequence[str]) -> np.ndarray:

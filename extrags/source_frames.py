@@ -26,6 +26,7 @@ def select_sources(
     size: tuple[int, int],
     typical_depth: Float[np.ndarray, "f"],
     count: int,
+    which: Int[np.ndarray, "k"] | None = None,
 ) -> Int[np.ndarray, "f s"]:
     """The frames that each frame is matched with: shared view times a triangulation angle near ten degrees.
 
@@ -39,6 +40,7 @@ def select_sources(
         size: height and width in pixels.
         typical_depth: median depth of each frame, in the poses' unit.
         count: S, at most one less than the frames.
+        which: frames that are asked for, the others have none; None: all.
 
     Returns:
         Indices of frames, the best first; -1 where there are fewer than S useful ones.
@@ -50,7 +52,7 @@ def select_sources(
     pixels = np.stack([columns.ravel(), rows.ravel(), np.ones(columns.size)], axis=1)
     centers, axes = world_from_camera[:, :3, 3], world_from_camera[:, :3, 2]
     from_world = np.linalg.inv(world_from_camera)
-    for frame in range(frames):
+    for frame in range(frames) if which is None else which.tolist():
         rays = pixels @ np.linalg.inv(K[frame]).T
         shells = np.concatenate([rays * typical_depth[frame] * share for share in (0.6, 1.0, 1.7)])
         points = shells @ world_from_camera[frame, :3, :3].T + centers[frame]

@@ -18,7 +18,7 @@ def estimating_settings(config: PosesConfig) -> PosesConfig:
 
 def lens_settings(config: IngestConfig) -> IngestConfig:
     """The settings of reading that say what becomes of depth, and of frames whose lens is found distorted."""
-    kept = ["depth_error"]
+    kept = ["depth_error", "correct_calibration"]
     if config.lens != "pinhole" or config.field_of_view_deg is not None:
         # Sizes are those of a pinhole that is wider than the lens's centre.
         kept += ["lens", "field_of_view_deg", "size", "width", "downscale"]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from operator import attrgetter
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field, ValidationError, field_validator
 
@@ -36,6 +36,10 @@ __all__ = [
     "PipelineConfig",
     "ReportConfig",
 ]
+
+
+LARGEST_DEPTH_ERROR = 0.5
+"""Relative error of depth that a source may be said to have."""
 
 
 class IngestConfig(StageConfig):
@@ -86,12 +90,18 @@ class IngestConfig(StageConfig):
         description="training frames keep no depth; held-out frames keep theirs for the evaluation alone. "
         "Points of a source that has depth go with it",
     )
-    depth_error: Annotated[float, Field(ge=0, le=0.5)] | Literal["auto"] = Field(
+    depth_error: float | Literal["auto"] = Field(
         "auto",
         description="relative error of depth that the source has. auto: none, unless training frames "
-        "disagree about their depth by more than poses that are off explain; a number: so much; 0: depth is "
-        "taken as it is. Depth with an error is corrected and combined with what the depth stage estimates. "
-        "auto also converts depth along the ray, or in another unit than the poses, where that is clear",
+        "disagree about their depth by more than poses that are off explain; a number from 0 to 0.5: so "
+        "much; 0: depth is taken as it is. Depth with an error is corrected and combined with what the depth "
+        "stage estimates",
+    )
+    correct_calibration: bool = Field(
+        True,
+        description="of sources with poses and depth: correct what all frames have in common, where their "
+        "depth tells it clearly: depth along the ray, its unit and offset, focal lengths and principal "
+        "point, or the place of the camera on what is tracked",
     )
     scale_mm_per_unit: float | None = Field(
         None,
@@ -132,6 +142,13 @@ class IngestConfig(StageConfig):
         "(calib_results.txt). It takes the place of intrinsics that are guessed or stated beside frames, and "
         "is refused where poses were solved with others; its content counts in cache keys, not its path",
     )
+
+    @field_validator("depth_error")
+    @classmethod
+    def _is_a_share(cls, error: float | str) -> float | str:
+        if isinstance(error, float) and not 0 <= error <= LARGEST_DEPTH_ERROR:
+            raise ValueError(f"expected auto or a number from 0 to {LARGEST_DEPTH_ERROR}")
+        return error
 
 
 class AssessConfig(StageConfig):

@@ -13,7 +13,6 @@ from extrags.cameras import as_rotation
 from extrags.config import DEFAULT_PROFILE, PROFILES, IngestConfig, PosesConfig
 from extrags.errors import CaptureError, ConfigError, ShapeError
 from extrags.frame_stacks import frames_of, stacked
-from extrags.measured_depth import as_given, with_depth_error
 from extrags.poses.attempts import attempted, enough_registered
 from extrags.poses.calibration import with_calibration
 from extrags.poses.job import PoseJob, PoseJobResult, run_job
@@ -30,7 +29,7 @@ from extrags.poses.registration_report import (
 from extrags.poses.rgbd import align_by_depth
 from extrags.poses.scale import typical_depth
 from extrags.poses.unit import unit_of_map
-from extrags.scarce_depth import without_scarce_depth
+from extrags.reading_corrections import as_given, with_corrections
 from extrags.sequence import EndoscopicSequence, ScaleSource, Split
 from extrags.threads import one_torch_thread
 
@@ -449,8 +448,7 @@ def with_estimated_poses(
     if estimate.calibration is not None:
         posed = with_calibration(posed, estimate.calibration, ingest)
     # Before, the depth of a few frames told the scale of the poses.
-    error = "auto" if ingest is None else ingest.depth_error
-    return with_depth_error(without_scarce_depth(posed), error)
+    return with_corrections(posed, ingest)
 
 
 def _run(job: PoseJob, name: str) -> PoseJobResult:

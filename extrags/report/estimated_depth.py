@@ -37,12 +37,14 @@ class EstimatedDepth:
         facts: figures with their names.
         unit: of the depths, in words.
         completed: whether a network had a part in it.
+        combined: whether measured depth had, which is shown beside it.
     """
 
     table: ImageTable
     facts: tuple[tuple[str, str], ...]
     unit: str
     completed: bool
+    combined: bool
 
 
 def estimated_depth(
@@ -57,13 +59,14 @@ def estimated_depth(
         largest_bytes: bound per image.
     """
     truth = _true_depth(sequence)
+    combined = bool(estimate.report.get("combined_with_measured", False))
     unit = "mm" if sequence.metric else "units of the scene"
     chosen = evenly_spaced(len(sequence.train), views)
     frames = sequence.train[chosen]
     masks = sequence.mask[frames]
     depths = {"Estimated depth": np.asarray(estimate.depth[chosen], dtype=np.float64)}
     if truth is not None:
-        depths["True depth, withheld"] = truth[chosen].astype(np.float64)
+        depths["Depth as measured" if combined else "True depth, withheld"] = truth[chosen].astype(np.float64)
     errors = np.where(masks, np.asarray(estimate.expected_error[chosen], dtype=np.float64), np.nan)
     known = np.concatenate([depth[(depth > 0) & masks] for depth in depths.values()])
     near, far = (
@@ -92,13 +95,12 @@ def estimated_depth(
     table = ImageTable(
         tuple(rows), scales, len(rows), len(sequence.train), masked=not bool(sequence.mask[frames].all())
     )
-    return EstimatedDepth(
-        table, tuple(_facts(sequence, estimate, truth)), unit, estimate.report["completion"] != "none"
-    )
+    facts = tuple(_facts(sequence, estimate, truth, combined=combined))
+    return EstimatedDepth(table, facts, unit, estimate.report["completion"] != "none", combined)
 
 
 def _facts(
-    sequence: EndoscopicSequence, estimate: DepthLike, truth: np.ndarray | None
+    sequence: EndoscopicSequence, estimate: DepthLike, truth: np.ndarray | None, *, combined: bool
 ) -> list[tuple[str, str]]:
     report = estimate.report
     facts = [
@@ -107,6 +109,8 @@ def _facts(
         ("Median expected error", f"{100 * report['median_expected_error']:.1f} %"),
         ("Pixels confirmed by other frames", f"{100 * report['agreeing_share']:.0f} %"),
     ]
+    if combined:
+        facts.insert(2, ("Error of the measured depth", f"{100 * report['median_measured_error']:.1f} %"))
     several = len(report["shading"]) > 1
     for index, fit in enumerate(report["shading"]):
         words = "no relation of brightness and distance"
@@ -127,7 +131,8 @@ def _facts(
         known = (truth > 0) & sequence.mask[sequence.train] & (estimate.depth > 0)
         if known.any():
             ratio = np.asarray(estimate.depth, dtype=np.float64)[known] / truth[known]
-            facts.append(("Mean relative error", f"{100 * float(np.abs(ratio - 1).mean()):.1f} %"))
+            name = "Mean difference from the measured depth" if combined else "Mean relative error"
+            facts.append((name, f"{100 * float(np.abs(ratio - 1).mean()):.1f} %"))
     return facts
 
 

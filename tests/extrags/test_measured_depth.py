@@ -11,7 +11,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import extrags
-from extrags.cameras import pixel_rays
 from extrags.measured_depth import as_given, measured_depth_error, with_depth_error
 from extrags.sequence import EndoscopicSequence, Split
 from extrags.training.reconstruction import refines_poses
@@ -56,7 +55,6 @@ def test_exact_depth_is_taken_as_it_is(exact: EndoscopicSequence, caplog: pytest
     found = measured_depth_error(exact)
     assert found is not None
     assert found.error < 1e-3
-    assert (found.unit, found.along_ray) == (1.0, False)
     assert with_depth_error(exact) is exact
     assert exact.median_depth_error == 0
     assert not caplog.messages
@@ -88,8 +86,8 @@ def test_a_frame_that_is_farther_off_is_told_apart(exact: EndoscopicSequence) ->
 
     found = measured_depth_error(with_depth(exact, one_much_worse))
     assert found is not None
-    assert found.frame_error.argmax() == 4
-    assert found.frame_error[4] > 3 * np.median(found.frame_error)
+    assert found.of_frame.argmax() == 4
+    assert found.of_frame[4] > 3 * np.median(found.of_frame)
 
 
 @pytest.mark.parametrize("factor", [1.0, 2.0])
@@ -99,26 +97,6 @@ def test_poses_that_are_off_are_no_error_of_depth(exact: EndoscopicSequence, fac
     assert found is not None
     assert found.beyond_motion < 0.2 * found.error
     assert with_depth_error(moved) is moved
-
-
-@pytest.mark.parametrize("factor", [0.8, 1.1])
-def test_another_unit_is_converted(
-    exact: EndoscopicSequence, factor: float, caplog: pytest.LogCaptureFixture
-) -> None:
-    found = with_depth_error(with_depth(exact, lambda _, depth: factor * depth))
-    assert found.depth_error is None
-    np.testing.assert_allclose(found.depth_mm, exact.depth_mm, rtol=0.005)
-    assert f"multiplied by {1 / factor:.3f}" in caplog.text
-
-
-def test_depth_along_the_ray_is_converted(
-    exact: EndoscopicSequence, caplog: pytest.LogCaptureFixture
-) -> None:
-    lengths = np.linalg.norm(pixel_rays(exact.cameras), axis=-1)
-    found = with_depth_error(with_depth(exact, lambda frame, depth: depth * lengths[frame]))
-    assert found.depth_error is None
-    np.testing.assert_allclose(found.depth_mm, exact.depth_mm, rtol=1e-5)
-    assert "it is converted to z-depth" in caplog.text
 
 
 def test_a_number_is_taken_for_it(exact: EndoscopicSequence) -> None:

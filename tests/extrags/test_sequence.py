@@ -199,7 +199,7 @@ class TestSequence:
         bare = replace(sequence, depth_mm=None, metric=False)
         assert "no depth, arbitrary scale" in repr(bare)
         estimated = replace(sequence, depth_error=np.zeros((4, 6, 8), np.float32))
-        assert "estimated depth" in repr(estimated)
+        assert "depth with an expected error" in repr(estimated)
 
     @pytest.mark.usefixtures("unchecked")
     def test_wrong_number_of_names(self) -> None:

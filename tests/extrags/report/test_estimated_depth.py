@@ -10,6 +10,7 @@ import pytest
 
 from extrags.config import ReportConfig
 from extrags.errors import ShapeError
+from extrags.measured_depth import with_depth_error
 from extrags.report import ReportInputs, build_report
 from extrags.report.estimated_depth import estimated_depth
 from extrags.sequence import EndoscopicSequence
@@ -112,3 +113,19 @@ def test_measured_depth_has_no_section(inputs: ReportInputs) -> None:
 def test_another_number_of_frames_is_refused(sequence: EndoscopicSequence, estimate: Estimate) -> None:
     with pytest.raises(ShapeError, match=r"estimated depth has shape \(5, 40, 48\), expected \(6, 40, 48\)"):
         ReportInputs(name="tube", sequence=sequence, depth=replace(estimate, depth=estimate.depth[1:]))
+
+
+def test_measured_depth_that_was_corrected_stands_beside_it(
+    sequence: EndoscopicSequence, estimate: Estimate
+) -> None:
+    told = {**estimate.report, "combined_with_measured": True, "median_measured_error": 0.045}
+    given = with_depth_error(sequence, 0.045)
+    inputs = ReportInputs(name="tube", sequence=given, depth=replace(estimate, report=told))
+    page = Page(build_report(inputs, CONFIG))
+    for words in (
+        "Error of the measured depth 4.5 %",
+        "Mean difference from the measured depth 5.0 %",
+        "disagree about the depth that the source brings",
+    ):
+        assert words in page.text
+    assert "Training frame b_001, depth as measured" in [str(image["alt"]) for image in page.images]

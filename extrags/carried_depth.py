@@ -1,0 +1,245 @@
+"""Measured depth of training frames, carried by the poses to the frames that see the same surface.
+
+Where depth, poses and intrinsics are right, it meets the depth that is measured there. What it is off by
+tells of errors that frames have in common (`extrags.rig_calibration`) and of each frame's own
+(`extrags.measured_depth`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from extrags.cameras import Cameras, project_points, transform_points, unproject_pixels
+from extrags.sequence import EndoscopicSequence
+from extrags.source_frames import select_sources
+
+__all__ = ["MEDIAN", "CarriedDepth", "Correction", "Pair", "evenly", "relative_error"]
+
+CHECKED_FRAMES = 60
+"""Training frames at most that are carried to others, spread over the recording."""
+
+COMPARED_WITH = 6
+"""Frames each is carried to."""
+
+WIDTH_PX = 256
+"""Depth maps are looked up at every so many pixels that about this width is left."""
+
+POINTS = 1500
+"""Pixels of a frame that are carried, about."""
+
+LEAST_POINTS = 100
+"""Points that meet depth in the other frame, below which a pair tells nothing."""
+
+SAME_SURFACE = 0.5
+"""Log-ratio of depths beyond which a point is hidden by another surface."""
+
+SMOOTH_STEP = 0.26
+"""Log-ratio of the depths round a pixel up to which they are of one surface."""
+
+MEDIAN = float(np.sqrt(2) / 1.4826)
+"""Median of the absolute difference of two depths, by the standard deviation of the error of either."""
+
+
+@dataclass(frozen=True)
+class Correction:
+    """What is changed of all frames alike.
+
+    Args:
+        log_factor: logarithm of a factor on depth.
+        offset: added to depth after that, in the sequence's unit.
+        log_focal: logarithms of factors on both focal lengths.
+        shift: of the principal point, as a share of the image's width.
+        turn: of each camera about its own axes, a rotation vector in radians.
+        move: of each camera along its own axes, in the sequence's unit.
+    """
+
+    log_factor: float = 0.0
+    offset: float = 0.0
+    log_focal: tuple[float, float] = (0.0, 0.0)
+    shift: tuple[float, float] = (0.0, 0.0)
+    turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    move: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def of_depth(self, depth: Float[np.ndarray, "*p"]) -> Float[np.ndarray, "*p"]:
+        """Corrected depth; 0 stays 0, and so does what would lie behind the camera."""
+        found = np.exp(self.log_factor) * depth + self.offset
+        return np.asarray(np.where((depth > 0) & (found > 0), found, 0))
+
+    def of_intrinsics(self, K: Float[np.ndarray, "*b 3 3"], width: float) -> Float[np.ndarray, "*b 3 3"]:
+        """Corrected intrinsics of images of this width."""
+        found = K.copy()
+        found[..., 0, 0] *= np.exp(self.log_focal[0])
+        found[..., 1, 1] *= np.exp(self.log_focal[1])
+        found[..., :2, 2] += np.array(self.shift) * width
+        return found
+
+    def of_poses(self, world_from_camera: Float[np.ndarray, "*b 4 4"]) -> Float[np.ndarray, "*b 4 4"]:
+        """Corrected poses."""
+        further = np.eye(4)
+        further[:3, :3] = Rotation.from_rotvec(self.turn).as_matrix()
+        further[:3, 3] = self.move
+        return np.asarray(world_from_camera @ further)
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two training frames, by their positions among these, that see the same surface."""
+
+    first: int
+    second: int
+
+
+@dataclass
+class CarriedDepth:
+    """Depth of training frames, as it is looked up from other frames.
+
+    Args:
+        sequence: with poses and depth.
+    """
+
+    sequence: EndoscopicSequence
+    cameras: Cameras = field(init=False)
+    typical: Float[np.ndarray, "n"] = field(init=False)
+    """Median depth of each training frame; 0 where none is known."""
+    pairs: list[Pair] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._stride = max(1, round(self.sequence.width / WIDTH_PX))
+        cameras = self.sequence.training_cameras
+        K = cameras.K.copy()
+        # The pixel that is kept is the middle one.
+        K[:, :2, 2] -= self._stride // 2 + 0.5
+        K[:, :2] /= self._stride
+        K[:, :2, 2] += 0.5
+        height, width = self.sequence.mask[0][self._kept].shape
+        self.cameras = Cameras(K, cameras.world_from_camera, width, height, cameras.lens)
+        self._inverse_depth: dict[int, Float[np.ndarray, "h w"]] = {}
+        self._pixels: dict[int, tuple[Float[np.ndarray, "p 2"], Float[np.ndarray, "p"]]] = {}
+        self.typical = np.array([_median(self.known(k)) for k in range(len(self.cameras))])
+        self.pairs = self._found_pairs()
+
+    def known(self, position: int) -> Float[np.ndarray, "h w"]:
+        """Depth of a training frame inside its mask, else 0, at the pixels that are kept."""
+        frame = int(self.sequence.train[position])
+        assert self.sequence.depth_mm is not None
+        depth, mask = (stack[frame][self._kept] for stack in (self.sequence.depth_mm, self.sequence.mask))
+        return np.where(mask, depth, 0).astype(np.float64)
+
+    @property
+    def _kept(self) -> tuple[slice, slice]:
+        kept = slice(self._stride // 2, None, self._stride)
+        return kept, kept
+
+    def motion(self, pair: Pair, correction: Correction | None = None) -> Float[np.ndarray, "4 4"]:
+        """From the first camera's axes to the second's."""
+        poses = self.cameras.world_from_camera[[pair.first, pair.second]]
+        poses = poses if correction is None else correction.of_poses(poses)
+        return np.asarray(np.linalg.inv(poses[1]) @ poses[0])
+
+    def log_ratio(
+        self,
+        pair: Pair,
+        *,
+        motion: Float[np.ndarray, "4 4"] | None = None,
+        correction: Correction | None = None,
+        along_ray: bool = False,
+        every: int = 1,
+    ) -> Float[np.ndarray, "p"]:
+        """Log of the depth that the second frame has where the first one's points fall, over theirs.
+
+        Between pixels the inverse of depth is interpolated, which is linear over a plane. NaN where the
+        pixels round a point are not of one surface, or unknown, or outside the image.
+
+        Args:
+            pair: of frames.
+            motion: from the first camera's axes to the second's, in place of that of the poses.
+            correction: of what is common to all frames.
+            along_ray: read depth as the distance along the ray.
+            every: carry one in so many of the points.
+        """
+        K = self.cameras.K[[pair.first, pair.second]]
+        centers, z = (part[::every] for part in self._carried(pair.first))
+        if correction is not None:
+            K, z = correction.of_intrinsics(K, self.sequence.width / self._stride), correction.of_depth(z)
+        points = unproject_pixels(centers, K[0], self.cameras.lens) * z[:, None]
+        if along_ray:
+            points = points * (z / np.linalg.norm(points, axis=1))[:, None]
+        motion = self.motion(pair, correction) if motion is None else motion
+        carried = transform_points(motion, points)
+        reached = np.linalg.norm(carried, axis=1) if along_ray else carried[:, 2]
+        pixels = project_points(carried, K[1], self.cameras.lens) - 0.5
+        inverse = self._inverse(pair.second)
+        height, width = inverse.shape
+        with np.errstate(invalid="ignore"):
+            inside = (pixels >= 0).all(1) & (pixels[:, 0] < width - 1) & (pixels[:, 1] < height - 1)
+        inside &= (carried[:, 2] > 0) & (z > 0)
+        column, row = np.floor(pixels[inside]).astype(np.int64).T
+        right, down = (pixels[inside] - np.stack([column, row], axis=1)).T
+        corners = np.stack([inverse[row + j, column + i] for j in (0, 1) for i in (0, 1)])
+        shares = np.stack([(1 - down) * (1 - right), (1 - down) * right, down * (1 - right), down * right])
+        nearest, farthest = corners.max(0), corners.min(0)
+        one_surface = (farthest > 0) & (nearest < np.exp(SMOOTH_STEP) * farthest)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            there = 1 / (shares * corners).sum(0)
+            ratio = np.log(there if correction is None else correction.of_depth(there)) - np.log(
+                reached[inside]
+            )
+        found = np.full(len(z), np.nan)
+        found[inside] = np.where(one_surface & (np.abs(ratio) < SAME_SURFACE), ratio, np.nan)
+        return found
+
+    def _found_pairs(self) -> list[Pair]:
+        """Pairs of training frames that see the same surface from places that differ."""
+        count, typical = len(self.cameras), self.typical.copy()
+        if not (typical > 0).any():
+            return []
+        typical[typical == 0] = np.median(typical[typical > 0])
+        chosen = evenly(count, CHECKED_FRAMES)
+        poses, K = (part.astype(np.float64) for part in (self.cameras.world_from_camera, self.cameras.K))
+        size = self.cameras.height, self.cameras.width
+        sources = select_sources(poses, K, size, typical, COMPARED_WITH, chosen)
+        found = []
+        for position in chosen.tolist():
+            for other in sources[position][sources[position] >= 0].tolist():
+                pair = Pair(position, other)
+                if np.isfinite(self.log_ratio(pair)).sum() >= LEAST_POINTS:
+                    found.append(pair)
+        return found
+
+    def _carried(self, position: int) -> tuple[Float[np.ndarray, "p 2"], Float[np.ndarray, "p"]]:
+        """Pixels of a frame on a grid, and their depth."""
+        if position not in self._pixels:
+            depth = self.known(position)
+            stride = max(1, int(np.sqrt(depth.size / POINTS)))
+            v, u = np.mgrid[stride // 2 : depth.shape[0] : stride, stride // 2 : depth.shape[1] : stride]
+            v, u = v.ravel(), u.ravel()
+            known = depth[v, u] > 0
+            centers = np.stack([u[known], v[known]], axis=1) + 0.5
+            self._pixels[position] = centers, depth[v, u][known]
+        return self._pixels[position]
+
+    def _inverse(self, position: int) -> Float[np.ndarray, "h w"]:
+        if position not in self._inverse_depth:
+            depth = self.known(position)
+            self._inverse_depth[position] = np.divide(1, depth, out=np.zeros_like(depth), where=depth > 0)
+        return self._inverse_depth[position]
+
+
+def relative_error(ratios: list[Float[np.ndarray, "_"]]) -> float:
+    """Relative error of depth that explains log-ratios, a median; NaN among them does not count."""
+    known = np.concatenate([ratio[np.isfinite(ratio)] for ratio in ratios]) if ratios else np.zeros(0)
+    return float(np.median(np.abs(known)) / MEDIAN) if len(known) else 0.0
+
+
+def evenly(count: int, at_most: int) -> np.ndarray:
+    """Up to so many of the first `count` indices, evenly spaced."""
+    return np.unique(np.linspace(0, count - 1, min(count, at_most)).round().astype(np.int64))
+
+
+def _median(depth: Float[np.ndarray, "h w"]) -> float:
+    known = depth[depth > 0]
+    return float(np.median(known)) if len(known) else 0.0

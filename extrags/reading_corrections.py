@@ -1,0 +1,38 @@
+"""What is mended of every sequence that was read, before any stage sees it."""
+
+from __future__ import annotations
+
+from extrags.config import IngestConfig
+from extrags.depth_noise import with_clean_depth
+from extrags.measured_depth import as_given, with_depth_error
+from extrags.rig_calibration import with_calibration_corrected
+from extrags.scarce_depth import without_scarce_depth
+from extrags.sequence import EndoscopicSequence
+from extrags.unusable_frames import without_blank_frames, without_misplaced_frames
+
+__all__ = ["as_given", "with_corrections"]
+
+
+def with_corrections(sequence: EndoscopicSequence, config: IngestConfig | None = None) -> EndoscopicSequence:
+    """The sequence without unusable frames, its depth cleaned, brought into line with the poses, and judged.
+
+    In this order, each with a warning where it changes anything: frames that show nothing are left out; depth
+    of few frames is left to the evaluation; speckles and noise of depth are taken out; what all frames have
+    in common and is off is corrected; frames whose poses are grossly wrong are left out; and depth that
+    frames disagree about is given an expected error. Of a sequence without poses the first alone.
+
+    Args:
+        sequence: as its source has it.
+        config: settings of reading; None takes their defaults.
+    """
+    config = IngestConfig() if config is None else config
+    sequence = without_blank_frames(sequence)
+    if sequence.world_from_camera is None:
+        return sequence
+    sequence = without_scarce_depth(sequence)
+    if config.depth_error == "auto":
+        sequence = with_clean_depth(sequence)
+    if config.correct_calibration:
+        sequence = with_calibration_corrected(sequence)
+    sequence = without_misplaced_frames(sequence)
+    return with_depth_error(sequence, config.depth_error)

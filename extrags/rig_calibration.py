@@ -1,0 +1,241 @@
+"""What all frames have in common and is off: the reading of depth, the lens, the camera on what is tracked.
+
+Each is a few numbers, and depth that poses carry from frame to frame tells them, since they bend it alike
+everywhere. Poses of single frames that are off, and depth that is off in each frame in another way, do not:
+there no such numbers make the disagreement much smaller, and nothing is corrected.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from extrags.cameras import unproject_pixels
+from extrags.carried_depth import MEDIAN, CarriedDepth, Correction, Pair, evenly, relative_error
+from extrags.frame_stacks import stacked
+from extrags.sequence import EndoscopicSequence
+
+__all__ = ["with_calibration_corrected"]
+
+_log = logging.getLogger(__name__)
+
+_TOPIC = {"topic": "depth and poses", "field": "depth_mm"}
+
+LEAST_ERROR = 0.0015
+"""Of depth, below which nothing is looked for: exact depth has 0.0003."""
+
+CLEARLY_LESS = 0.5
+"""Share of the disagreement that is left, at most, of what is corrected."""
+
+CLEARLY_ALONG_RAY = 0.25
+"""The same of depth along the ray: where a scope moves little, either reading carries nearly as well."""
+
+SIMPLER = 0.8
+"""A correction of more numbers has to leave so much less than one of fewer."""
+
+FITTED_PAIRS = 60
+"""Pairs at most that a correction is fitted to."""
+
+EVERY = 3
+"""One in so many points of a frame is used."""
+
+CORRECTIONS = 3
+"""At most, one after the other."""
+
+ROUNDS = 10
+"""Of reweighted least squares."""
+
+STEP = 1e-3
+"""Of the derivatives, in the scale of each number."""
+
+HELD = 1e-3
+"""Weight of no correction, beside that of all points: what nothing tells stays."""
+
+
+@dataclass(frozen=True)
+class _Family:
+    """Corrections of one kind.
+
+    Args:
+        words: what is corrected, for the warning.
+        scale: of each number, which is about the error that it can have.
+        made: the correction of numbers in these scales.
+        told: numbers of a correction, in words.
+    """
+
+    words: str
+    scale: tuple[float, ...]
+    made: Callable[[Float[np.ndarray, "k"]], Correction]
+    told: Callable[[Correction], str]
+
+
+def _families(length: float) -> tuple[_Family, ...]:
+    """Those there are, from few numbers to more; lengths are in median depths."""
+    return (
+        _Family(
+            "depth is not in the unit of the poses, or has an offset",
+            (0.1, 0.1 * length),
+            lambda x: Correction(log_factor=float(x[0]), offset=float(x[1])),
+            lambda c: f"depth is multiplied by {np.exp(c.log_factor):.3f}, and {c.offset:+.3g} is added",
+        ),
+        _Family(
+            "focal length or principal point are off",
+            (0.05, 0.05, 0.02, 0.02),
+            lambda x: Correction(log_focal=_two(x[:2]), shift=_two(x[2:])),
+            lambda c: (
+                "focal lengths are multiplied by {:.3f} and {:.3f}, ".format(*np.exp(c.log_focal))
+                + "the principal point is moved by ({:+.2f}, {:+.2f}) % of the width".format(
+                    *(100 * part for part in c.shift)
+                )
+            ),
+        ),
+        _Family(
+            "the camera stands and looks otherwise on what is tracked (hand-eye calibration)",
+            (*(0.03,) * 3, *(0.1 * length,) * 3),
+            lambda x: Correction(turn=_three(x[:3]), move=_three(x[3:])),
+            lambda c: (
+                f"each camera is turned by {np.degrees(np.linalg.norm(c.turn)):.2f} degrees and moved by "
+                f"{np.linalg.norm(c.move):.3g}"
+            ),
+        ),
+    )
+
+
+def with_calibration_corrected(sequence: EndoscopicSequence) -> EndoscopicSequence:
+    """The sequence with what its frames have in common corrected, where their depth tells it clearly.
+
+    Depth along the ray becomes z-depth. Of depth's unit and offset, of focal lengths and principal point, and
+    of a turn and shift of the camera on what is tracked, the one is corrected that leaves least of the
+    disagreement, if that is half of it at most; of all frames, held-out ones too. What is left then may be
+    explained by another. A warning says what, and by how much. The sequence is returned as it is where
+    nothing is off, or nothing of this explains it.
+
+    Args:
+        sequence: with poses and depth of training frames.
+    """
+    if sequence.world_from_camera is None or not sequence.training_depth_known or len(sequence.train) < 2:
+        return sequence
+    if sequence.depth_error is not None:
+        return sequence
+    for _ in range(CORRECTIONS):
+        corrected = _corrected_once(sequence)
+        if corrected is sequence:
+            break
+        sequence = corrected
+    return sequence
+
+
+def _corrected_once(sequence: EndoscopicSequence) -> EndoscopicSequence:
+    carried = CarriedDepth(sequence)
+    if not carried.pairs:
+        return sequence
+    pairs = [carried.pairs[k] for k in evenly(len(carried.pairs), FITTED_PAIRS).tolist()]
+    error = relative_error([carried.log_ratio(pair) for pair in pairs])
+    if error < LEAST_ERROR:
+        return sequence
+    along_ray = relative_error([carried.log_ratio(pair, along_ray=True) for pair in pairs])
+    if along_ray < CLEARLY_ALONG_RAY * error:
+        _warn(sequence, error, along_ray, "depth is the distance along the ray", "it is converted to z-depth")
+        return _with_depth(sequence, lambda frame, depth: depth / _ray_lengths(sequence, frame))
+    best, left, family = Correction(), CLEARLY_LESS * error, None
+    families = _families(float(np.median(carried.typical[carried.typical > 0])))
+    # Points of the source were found with its poses and lens, and do not follow another.
+    for candidate in families if sequence.points is None else families[:1]:
+        found = _fitted(carried, pairs, candidate)
+        remains = relative_error([carried.log_ratio(pair, correction=found) for pair in pairs])
+        if remains < (left if family is None else SIMPLER * left):
+            best, left, family = found, remains, candidate
+    if family is None:
+        return sequence
+    _warn(sequence, error, left, family.words, family.told(best))
+    return replace(
+        _with_depth(sequence, lambda frame, depth: best.of_depth(depth)),
+        K=best.of_intrinsics(sequence.K, sequence.width),
+        world_from_camera=best.of_poses(sequence.cameras.world_from_camera),
+    )
+
+
+def _fitted(carried: CarriedDepth, pairs: list[Pair], family: _Family) -> Correction:
+    """The correction of a family that makes the disagreement least.
+
+    Gauss-Newton with the weights of a Cauchy distribution; the derivatives by differences, so that they hold
+    for any lens.
+    """
+    numbers = np.zeros(len(family.scale))
+    scale = np.array(family.scale)
+
+    def ratios(numbers: Float[np.ndarray, "k"]) -> Float[np.ndarray, "p"]:
+        correction = family.made(scale * numbers)
+        parts = [carried.log_ratio(pair, correction=correction, every=EVERY) for pair in pairs]
+        return np.concatenate(parts)
+
+    for _ in range(ROUNDS):
+        ratio = ratios(numbers)
+        J = np.stack(
+            [(ratios(numbers + STEP * axis) - ratio) / STEP for axis in np.eye(len(numbers))], axis=1
+        )
+        known = np.isfinite(ratio) & np.isfinite(J).all(1)
+        spread = max(relative_error([ratio]) * np.sqrt(2), 1e-6)
+        weight = 1 / (1 + (ratio[known] / (2 * spread)) ** 2)
+        A = (weight[:, None] * J[known]).T @ J[known]
+        # Where cameras do not turn, a shift of all of them changes nothing; no pair tells it then.
+        A += HELD * np.trace(A) / len(A) * np.eye(len(A))
+        step = np.linalg.solve(A, -(weight[:, None] * J[known]).T @ ratio[known])
+        step /= max(1.0, float(np.abs(step).max()))
+        numbers = numbers + step
+        if np.abs(step).max() < STEP:
+            break
+    return family.made(scale * numbers)
+
+
+def _warn(sequence: EndoscopicSequence, error: float, left: float, found: str, done: str) -> None:
+    _log.warning(
+        "%s: depth that the poses carry from frame to frame is off by %.1f %% (median), but by %.1f %% if "
+        "%s: %s (ingest.correct_calibration=false leaves it)",
+        sequence.name,
+        100 * MEDIAN * error,
+        100 * MEDIAN * left,
+        found,
+        done,
+        extra=_TOPIC,
+    )
+
+
+def _with_depth(
+    sequence: EndoscopicSequence, changed: Callable[[int, Float[np.ndarray, "h w"]], np.ndarray]
+) -> EndoscopicSequence:
+    """With all depth changed, frame by frame; unknown depth stays unknown."""
+
+    def of_all(depth_mm: np.ndarray | None) -> np.ndarray | None:
+        if depth_mm is None:
+            return None
+        frames = (
+            np.where(depth > 0, changed(k, depth), 0).astype(depth.dtype) for k, depth in enumerate(depth_mm)
+        )
+        return stacked(frames, len(depth_mm))
+
+    return replace(
+        sequence,
+        depth_mm=of_all(sequence.depth_mm),
+        withheld_depth_mm=of_all(sequence.withheld_depth_mm),
+    )
+
+
+def _ray_lengths(sequence: EndoscopicSequence, frame: int) -> Float[np.ndarray, "h w"]:
+    """Distance along each pixel's ray where z-depth is 1."""
+    v, u = np.mgrid[: sequence.height, : sequence.width]
+    centers = np.stack([u.ravel(), v.ravel()], axis=1) + 0.5
+    rays = unproject_pixels(centers, sequence.K[frame], sequence.lens)
+    return np.asarray(np.linalg.norm(rays, axis=1).reshape(sequence.height, sequence.width))
+
+
+def _two(numbers: Float[np.ndarray, "2"]) -> tuple[float, float]:
+    return float(numbers[0]), float(numbers[1])
+
+
+def _three(numbers: Float[np.ndarray, "3"]) -> tuple[float, float, float]:
+    return float(numbers[0]), float(numbers[1]), float(numbers[2])

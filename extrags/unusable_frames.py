@@ -1,0 +1,109 @@
+"""Frames that show nothing, and frames whose pose is grossly wrong: no stage uses them."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Bool, Int, UInt8
+
+from extrags.carried_depth import CarriedDepth, relative_error
+from extrags.sequence import EndoscopicSequence
+from extrags.splits import Split
+
+__all__ = ["shows_nothing", "without_blank_frames", "without_misplaced_frames"]
+
+_log = logging.getLogger(__name__)
+
+DARK = 20
+"""Brightest channel of 255 that hardly a pixel of a black frame exceeds."""
+
+UNIFORM = 10
+"""Spread of each channel of 255, below which a frame has one colour: a lens on the wall, or covered."""
+
+LOOKED_AT_PX = 20_000
+"""Pixels of a frame that tell, about."""
+
+HARDLY = 2.0
+"""Percent of the pixels at either end that are passed over: highlights, dead pixels, a clock."""
+
+MOST = 0.25
+"""Share of training frames that may be unusable; where more seem so, it is the scene, and all are kept."""
+
+LEAST_LEFT = 2
+"""Training frames that are kept in any case."""
+
+PARTNERS = 3
+"""Frames that agree best with a frame, which judge its pose."""
+
+MISPLACED_TIMES, MISPLACED_ERROR = 5.0, 0.02
+"""A misplaced frame disagrees with them so many times as much as frames do in the median, and by so much."""
+
+
+def shows_nothing(rgb: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]) -> bool:
+    """Whether a picture is black, or of one colour, inside its mask."""
+    every = max(1, round(np.sqrt(mask.size / LOOKED_AT_PX)))
+    pixels = rgb[::every, ::every][mask[::every, ::every]]
+    if not len(pixels):
+        return True
+    low, high = np.percentile(pixels, (HARDLY, 100 - HARDLY), axis=0)
+    return bool(high.max() < DARK or (high - low).max() < UNIFORM)
+
+
+def without_blank_frames(sequence: EndoscopicSequence) -> EndoscopicSequence:
+    """The sequence, its split without frames that show nothing; a warning names them.
+
+    A camera that is covered or switched off between two frames teaches the surface to be black. Held-out
+    frames of this kind measure nothing.
+    """
+    blank = np.array(
+        [shows_nothing(rgb, mask) for rgb, mask in zip(sequence.rgb, sequence.mask, strict=True)], dtype=bool
+    )
+    return _without(sequence, np.flatnonzero(blank), "black, or of one colour")
+
+
+def without_misplaced_frames(sequence: EndoscopicSequence) -> EndoscopicSequence:
+    """The sequence, its split without training frames whose pose is grossly wrong; a warning names them.
+
+    Depth that is carried to the frames that agree with it best is off by much more than that of other frames.
+
+    Args:
+        sequence: with poses and depth of training frames, else it is returned as it is.
+    """
+    if sequence.world_from_camera is None or not sequence.training_depth_known or len(sequence.train) < 4:
+        return sequence
+    carried = CarriedDepth(sequence)
+    errors: dict[int, list[float]] = {}
+    for pair in carried.pairs:
+        error = relative_error([carried.log_ratio(pair)])
+        for position in (pair.first, pair.second):
+            errors.setdefault(position, []).append(error)
+    best = {position: float(np.mean(sorted(found)[:PARTNERS])) for position, found in errors.items()}
+    if not best:
+        return sequence
+    limit = max(MISPLACED_TIMES * float(np.median(list(best.values()))), MISPLACED_ERROR)
+    wrong = np.array(sorted(position for position, error in best.items() if error > limit), dtype=np.int64)
+    return _without(sequence, sequence.train[wrong], "at a place that the depth of the others contradicts")
+
+
+def _without(sequence: EndoscopicSequence, frames: Int[np.ndarray, "n"], what: str) -> EndoscopicSequence:
+    """With a split that does not name these frames."""
+    split = sequence.split
+    train, test = (np.setdiff1d(part, frames) for part in (split.train, split.test))
+    lost = len(split.train) - len(train)
+    if lost + len(split.test) - len(test) == 0:
+        return sequence
+    if lost > MOST * len(split.train) or len(train) < min(LEAST_LEFT, len(split.train)):
+        return sequence
+    gone = np.intersect1d(frames, np.concatenate([split.train, split.test]))
+    _log.warning(
+        "%s: %d of %d frames, %s first, are %s: they are left out",
+        sequence.name,
+        len(gone),
+        len(split.train) + len(split.test),
+        sequence.frame_name(int(gone[0])),
+        what,
+        extra={"topic": "unusable frames"},
+    )
+    return replace(sequence, split=Split(split.name, train, test, split.version))

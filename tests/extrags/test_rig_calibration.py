@@ -1,0 +1,138 @@
+"""What all frames have in common, off by a known amount and found again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from extrags.cameras import pixel_rays
+from extrags.carried_depth import CarriedDepth, Correction, relative_error
+from extrags.rig_calibration import with_calibration_corrected
+from extrags.sequence import EndoscopicSequence
+from tests.extrags.depth.withheld import recorded
+from tests.extrags.test_measured_depth import displaced, smoothly_wrong, with_depth
+
+
+@pytest.fixture(scope="module")
+def exact() -> EndoscopicSequence:
+    return recorded(10, 96, 72)
+
+
+def with_lens(focal: tuple[float, float], shift_px: tuple[float, float]) -> Callable[..., EndoscopicSequence]:
+    def changed(sequence: EndoscopicSequence) -> EndoscopicSequence:
+        K = sequence.K.copy()
+        K[:, [0, 1], [0, 1]] *= focal
+        K[:, :2, 2] += shift_px
+        return replace(sequence, K=K)
+
+    return changed
+
+
+def with_hand_eye(turn_deg: float, shift_mm: float) -> Callable[..., EndoscopicSequence]:
+    def changed(sequence: EndoscopicSequence) -> EndoscopicSequence:
+        further = np.eye(4)
+        further[:3, :3] = Rotation.from_rotvec(np.radians(turn_deg) * np.array([0.6, 0.8, 0])).as_matrix()
+        further[:3, 3] = shift_mm * np.array([0.8, -0.6, 0])
+        return replace(sequence, world_from_camera=sequence.cameras.world_from_camera @ further)
+
+    return changed
+
+
+def motions(sequence: EndoscopicSequence) -> np.ndarray:
+    """From each camera to the next: what poses are, whatever their world."""
+    poses = sequence.cameras.world_from_camera
+    return np.asarray(np.linalg.inv(poses[1:]) @ poses[:-1])
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        (lambda s: with_depth(s, lambda _, depth: 1.1 * depth), "depth is multiplied by 0.909"),
+        (lambda s: with_depth(s, lambda _, depth: depth + 2), "-2 is added"),
+        (with_lens((1.05, 1.05), (0, 0)), "focal lengths are multiplied by 0.95"),
+        (with_lens((1, 1.06), (0, 0)), "focal lengths are multiplied by 1.000 and 0.94"),
+        (with_lens((1, 1), (1.2, -0.9)), "the principal point is moved by (-1.2"),
+        (with_hand_eye(0, 2), "and moved by 2"),
+    ],
+    ids=["unit", "offset", "focal length", "aspect", "principal point", "hand-eye"],
+)
+def test_what_is_off_is_found_again(
+    exact: EndoscopicSequence,
+    changed: Callable[[EndoscopicSequence], EndoscopicSequence],
+    said: str,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    found = with_calibration_corrected(changed(exact))
+    assert said in caplog.text
+    np.testing.assert_allclose(found.depth_mm, exact.depth_mm, rtol=3e-3)
+    np.testing.assert_allclose(found.K, exact.K, atol=0.1)
+    np.testing.assert_allclose(motions(found), motions(exact), atol=0.02)
+
+
+def test_depth_along_the_ray_is_converted(
+    exact: EndoscopicSequence, caplog: pytest.LogCaptureFixture
+) -> None:
+    lengths = np.linalg.norm(pixel_rays(exact.cameras), axis=-1)
+    found = with_calibration_corrected(with_depth(exact, lambda frame, depth: depth * lengths[frame]))
+    np.testing.assert_allclose(found.depth_mm, exact.depth_mm, rtol=1e-5)
+    assert "it is converted to z-depth" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        lambda s: s,
+        lambda s: displaced(s, 1.0, 0.6),
+        lambda s: with_depth(s, smoothly_wrong(0.05)),
+        lambda s: s.without_training_depth(),
+        lambda s: replace(s, world_from_camera=None),
+    ],
+    ids=["nothing", "poses", "depth", "no depth", "no poses"],
+)
+def test_nothing_is_corrected_that_is_not_common_to_all(
+    exact: EndoscopicSequence,
+    changed: Callable[[EndoscopicSequence], EndoscopicSequence],
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    given = changed(exact)
+    assert with_calibration_corrected(given) is given
+    assert not caplog.messages
+
+
+def test_with_points_of_the_source_neither_lens_nor_poses_change(exact: EndoscopicSequence) -> None:
+    given = replace(with_lens((1.05, 1.05), (0, 0))(exact), points=np.ones((30, 3)))
+    found = with_calibration_corrected(given)
+    np.testing.assert_array_equal(found.K, given.K)
+    np.testing.assert_array_equal(found.world_from_camera, given.world_from_camera)
+
+
+def test_of_two_errors_at_once_most_is_taken_out(exact: EndoscopicSequence) -> None:
+    given = with_depth(with_hand_eye(0, 2)(exact), lambda _, depth: 1.1 * depth)
+    found = with_calibration_corrected(given)
+    before, after = (
+        relative_error([carried.log_ratio(pair) for pair in carried.pairs])
+        for carried in (CarriedDepth(given), CarriedDepth(found))
+    )
+    assert after < 0.4 * before
+
+
+def test_larger_maps_are_looked_up_at_every_other_pixel(exact: EndoscopicSequence) -> None:
+    large = recorded(4, 640, 480)
+    carried = CarriedDepth(large)
+    assert carried.cameras.width == 320
+    assert relative_error([carried.log_ratio(pair) for pair in carried.pairs]) < 1e-3
+
+
+def test_corrections_keep_what_is_unknown_and_undo_each_other(exact: EndoscopicSequence) -> None:
+    depth = np.array([0.0, 1.0, 30.0])
+    assert Correction(offset=-2.0).of_depth(depth).tolist() == [0, 0, 28]
+    there = Correction(log_focal=(0.1, 0.2), shift=(0.01, 0.02)).of_intrinsics(exact.K, exact.width)
+    back = Correction(log_focal=(-0.1, -0.2), shift=(-0.01, -0.02)).of_intrinsics(there, exact.width)
+    np.testing.assert_allclose(back, exact.K, rtol=1e-12)
+    poses = exact.cameras.world_from_camera
+    turned = Correction(turn=(0.1, 0, 0)).of_poses(Correction(turn=(-0.1, 0, 0)).of_poses(poses))
+    np.testing.assert_allclose(turned, poses, atol=1e-12)
