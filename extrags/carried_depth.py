@@ -40,6 +40,12 @@ SAME_SURFACE = 0.5
 SMOOTH_STEP = 0.26
 """Log-ratio of the depths round a pixel up to which they are of one surface."""
 
+ROUNDS = 3
+"""Of reweighted least squares for the motion of a pair."""
+
+STEP = 1e-3
+"""Of its derivatives, in radians and in median depths of a frame."""
+
 MEDIAN = float(np.sqrt(2) / 1.4826)
 """Median of the absolute difference of two depths, by the standard deviation of the error of either."""
 
@@ -192,6 +198,30 @@ class CarriedDepth:
         found[inside] = np.where(one_surface & (np.abs(ratio) < SAME_SURFACE), ratio, np.nan)
         return found
 
+    def beyond_motion(self, pair: Pair) -> Float[np.ndarray, "p"]:
+        """Log-ratios of a pair after the rigid motion between its cameras that makes them smallest.
+
+        Gauss-Newton with the weights of a Cauchy distribution; the derivatives by differences, so that they
+        hold for any lens.
+        """
+        motion, length = self.motion(pair), float(self.typical[pair.first])
+        best = ratio = self.log_ratio(pair)
+        for _ in range(ROUNDS):
+            steps = STEP * np.eye(6)
+            moved = [self.log_ratio(pair, motion=_moved(motion, step, length)) for step in steps]
+            J = (np.stack(moved, axis=1) - ratio[:, None]) / STEP
+            both = np.isfinite(ratio) & np.isfinite(J).all(1)
+            if both.sum() < LEAST_POINTS:
+                break
+            spread = max(relative_error([ratio]) * np.sqrt(2), 1e-6)
+            root = 1 / np.sqrt(1 + (ratio[both] / (2 * spread)) ** 2)
+            step, *_ = np.linalg.lstsq(root[:, None] * J[both], -root * ratio[both], rcond=1e-6)
+            motion = _moved(motion, step, length)
+            ratio = self.log_ratio(pair, motion=motion)
+            if relative_error([ratio]) < relative_error([best]):
+                best = ratio
+        return best
+
     def _found_pairs(self) -> list[Pair]:
         """Pairs of training frames that see the same surface from places that differ."""
         count, typical = len(self.cameras), self.typical.copy()
@@ -227,6 +257,16 @@ class CarriedDepth:
             depth = self.known(position)
             self._inverse_depth[position] = np.divide(1, depth, out=np.zeros_like(depth), where=depth > 0)
         return self._inverse_depth[position]
+
+
+def _moved(
+    motion: Float[np.ndarray, "4 4"], step: Float[np.ndarray, "6"], length: float
+) -> Float[np.ndarray, "4 4"]:
+    """A motion, then a turn in radians and a shift in `length`, of the second camera's axes."""
+    further = np.eye(4)
+    further[:3, :3] = Rotation.from_rotvec(step[:3]).as_matrix()
+    further[:3, 3] = length * step[3:]
+    return np.asarray(further @ motion)
 
 
 def relative_error(ratios: list[Float[np.ndarray, "_"]]) -> float:

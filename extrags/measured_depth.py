@@ -15,9 +15,8 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
-from extrags.carried_depth import LEAST_POINTS, MEDIAN, CarriedDepth, Pair, evenly, relative_error
+from extrags.carried_depth import MEDIAN, CarriedDepth, evenly, relative_error
 from extrags.frame_stacks import stacked
 from extrags.sequence import EndoscopicSequence
 
@@ -35,12 +34,6 @@ EXACT = 0.003
 
 FITTED_PAIRS = 40
 """Pairs at most whose motion is fitted."""
-
-ROUNDS = 3
-"""Of reweighted least squares for the motion of a pair."""
-
-STEP = 1e-3
-"""Of its derivatives, in radians and in median depths of a frame."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +71,7 @@ def measured_depth_error(sequence: EndoscopicSequence) -> MeasuredDepthError | N
     error = beyond = relative_error(ratios)
     if error > EXACT:
         some = evenly(len(carried.pairs), FITTED_PAIRS).tolist()
-        beyond = relative_error([_beyond_motion(carried, carried.pairs[k]) for k in some])
+        beyond = relative_error([carried.beyond_motion(carried.pairs[k]) for k in some])
     of_frame = np.full(len(carried.cameras), error)
     for position in {pair.first for pair in carried.pairs}:
         own = [r for pair, r in zip(carried.pairs, ratios, strict=True) if pair.first == position]
@@ -135,38 +128,3 @@ def _uncertain(sequence: EndoscopicSequence, of_training: Float[np.ndarray, "n"]
     depth_error = stacked((np.full(size, error, np.float32) for error in of_frame), len(of_frame))
     true = sequence.depth_mm if sequence.withheld_depth_mm is None else sequence.withheld_depth_mm
     return replace(sequence, depth_error=depth_error, withheld_depth_mm=true)
-
-
-def _beyond_motion(carried: CarriedDepth, pair: Pair) -> Float[np.ndarray, "p"]:
-    """Log-ratios of a pair after the rigid motion that makes them smallest.
-
-    Gauss-Newton with the weights of a Cauchy distribution; the derivatives by differences, so that they hold
-    for any lens.
-    """
-    motion, length = carried.motion(pair), float(carried.typical[pair.first])
-    best = ratio = carried.log_ratio(pair)
-    for _ in range(ROUNDS):
-        steps = STEP * np.eye(6)
-        moved = [carried.log_ratio(pair, motion=_moved(motion, step, length)) for step in steps]
-        J = (np.stack(moved, axis=1) - ratio[:, None]) / STEP
-        both = np.isfinite(ratio) & np.isfinite(J).all(1)
-        if both.sum() < LEAST_POINTS:
-            break
-        spread = max(relative_error([ratio]) * np.sqrt(2), 1e-6)
-        root = 1 / np.sqrt(1 + (ratio[both] / (2 * spread)) ** 2)
-        step, *_ = np.linalg.lstsq(root[:, None] * J[both], -root * ratio[both], rcond=1e-6)
-        motion = _moved(motion, step, length)
-        ratio = carried.log_ratio(pair, motion=motion)
-        if relative_error([ratio]) < relative_error([best]):
-            best = ratio
-    return best
-
-
-def _moved(
-    motion: Float[np.ndarray, "4 4"], step: Float[np.ndarray, "6"], length: float
-) -> Float[np.ndarray, "4 4"]:
-    """A motion, then a turn in radians and a shift in `length`, of the second camera's axes."""
-    further = np.eye(4)
-    further[:3, :3] = Rotation.from_rotvec(step[:3]).as_matrix()
-    further[:3, 3] = length * step[3:]
-    return np.asarray(further @ motion)

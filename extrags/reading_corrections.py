@@ -33,6 +33,6 @@ def with_corrections(sequence: EndoscopicSequence, config: IngestConfig | None =
     if config.depth_error == "auto":
         sequence = with_clean_depth(sequence)
     if config.correct_calibration:
-        sequence = with_calibration_corrected(sequence)
+        sequence = with_calibration_corrected(sequence, lens=config.calibration is None)
     sequence = without_misplaced_frames(sequence)
     return with_depth_error(sequence, config.depth_error)

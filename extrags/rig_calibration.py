@@ -28,11 +28,11 @@ _TOPIC = {"topic": "depth and poses", "field": "depth_mm"}
 LEAST_ERROR = 0.0015
 """Of depth, below which nothing is looked for: exact depth has 0.0003."""
 
-CLEARLY_LESS = 0.5
+CLEARLY_LESS = 0.25
 """Share of the disagreement that is left, at most, of what is corrected."""
 
-CLEARLY_ALONG_RAY = 0.25
-"""The same of depth along the ray: where a scope moves little, either reading carries nearly as well."""
+PLAUSIBLE = 4.0
+"""Corrections that are so many times the scale of one of their numbers, or more, explain something else."""
 
 SIMPLER = 0.8
 """A correction of more numbers has to leave so much less than one of fewer."""
@@ -102,34 +102,45 @@ def _families(length: float) -> tuple[_Family, ...]:
                 f"{np.linalg.norm(c.move):.3g}"
             ),
         ),
+        _Family(
+            "both unit or offset of depth and the hand-eye calibration are off",
+            (0.1, 0.1 * length, *(0.03,) * 3, *(0.1 * length,) * 3),
+            lambda x: Correction(float(x[0]), float(x[1]), turn=_three(x[2:5]), move=_three(x[5:])),
+            lambda c: (
+                f"depth is multiplied by {np.exp(c.log_factor):.3f}, {c.offset:+.3g} is added, and each "
+                f"camera is turned by {np.degrees(np.linalg.norm(c.turn)):.2f} degrees and moved by "
+                f"{np.linalg.norm(c.move):.3g}"
+            ),
+        ),
     )
 
 
-def with_calibration_corrected(sequence: EndoscopicSequence) -> EndoscopicSequence:
+def with_calibration_corrected(sequence: EndoscopicSequence, *, lens: bool = True) -> EndoscopicSequence:
     """The sequence with what its frames have in common corrected, where their depth tells it clearly.
 
     Depth along the ray becomes z-depth. Of depth's unit and offset, of focal lengths and principal point, and
     of a turn and shift of the camera on what is tracked, the one is corrected that leaves least of the
-    disagreement, if that is half of it at most; of all frames, held-out ones too. What is left then may be
-    explained by another. A warning says what, and by how much. The sequence is returned as it is where
-    nothing is off, or nothing of this explains it.
+    disagreement, if that is a quarter of it at most, or unit, offset, turn and shift together; of all frames,
+    held-out ones too. What is left then may be explained by another. A warning says what, and by how much.
+    The sequence is returned as it is where nothing is off, or nothing of this explains it.
 
     Args:
         sequence: with poses and depth of training frames.
+        lens: whether the lens may be what is off.
     """
     if sequence.world_from_camera is None or not sequence.training_depth_known or len(sequence.train) < 2:
         return sequence
     if sequence.depth_error is not None:
         return sequence
     for _ in range(CORRECTIONS):
-        corrected = _corrected_once(sequence)
+        corrected = _corrected_once(sequence, lens)
         if corrected is sequence:
             break
         sequence = corrected
     return sequence
 
 
-def _corrected_once(sequence: EndoscopicSequence) -> EndoscopicSequence:
+def _corrected_once(sequence: EndoscopicSequence, lens: bool) -> EndoscopicSequence:
     carried = CarriedDepth(sequence)
     if not carried.pairs:
         return sequence
@@ -138,14 +149,17 @@ def _corrected_once(sequence: EndoscopicSequence) -> EndoscopicSequence:
     if error < LEAST_ERROR:
         return sequence
     along_ray = relative_error([carried.log_ratio(pair, along_ray=True) for pair in pairs])
-    if along_ray < CLEARLY_ALONG_RAY * error:
+    if along_ray < CLEARLY_LESS * error:
         _warn(sequence, error, along_ray, "depth is the distance along the ray", "it is converted to z-depth")
         return _with_depth(sequence, lambda frame, depth: depth / _ray_lengths(sequence, frame))
     best, left, family = Correction(), CLEARLY_LESS * error, None
     families = _families(float(np.median(carried.typical[carried.typical > 0])))
     # Points of the source were found with its poses and lens, and do not follow another.
-    for candidate in families if sequence.points is None else families[:1]:
+    may_change = (True, lens, True, True) if sequence.points is None else (True, False, False, False)
+    for candidate in (family for family, may in zip(families, may_change, strict=True) if may):
         found = _fitted(carried, pairs, candidate)
+        if found is None:
+            continue
         remains = relative_error([carried.log_ratio(pair, correction=found) for pair in pairs])
         if remains < (left if family is None else SIMPLER * left):
             best, left, family = found, remains, candidate
@@ -159,8 +173,8 @@ def _corrected_once(sequence: EndoscopicSequence) -> EndoscopicSequence:
     )
 
 
-def _fitted(carried: CarriedDepth, pairs: list[Pair], family: _Family) -> Correction:
-    """The correction of a family that makes the disagreement least.
+def _fitted(carried: CarriedDepth, pairs: list[Pair], family: _Family) -> Correction | None:
+    """The correction of a family that makes the disagreement least; None where it leaves what is plausible.
 
     Gauss-Newton with the weights of a Cauchy distribution; the derivatives by differences, so that they hold
     for any lens.
@@ -187,6 +201,8 @@ def _fitted(carried: CarriedDepth, pairs: list[Pair], family: _Family) -> Correc
         step = np.linalg.solve(A, -(weight[:, None] * J[known]).T @ ratio[known])
         step /= max(1.0, float(np.abs(step).max()))
         numbers = numbers + step
+        if np.abs(numbers).max() >= PLAUSIBLE:
+            return None
         if np.abs(step).max() < STEP:
             break
     return family.made(scale * numbers)

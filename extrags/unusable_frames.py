@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Int, UInt8
 
-from extrags.carried_depth import CarriedDepth, relative_error
+from extrags.carried_depth import CarriedDepth, Pair, relative_error
 from extrags.sequence import EndoscopicSequence
 from extrags.splits import Split
 
@@ -36,6 +36,9 @@ LEAST_LEFT = 2
 
 PARTNERS = 3
 """Frames that agree best with a frame, which judge its pose."""
+
+EXPLAINED = 0.3
+"""Share of the disagreement that is left, at most, with another motion between the cameras."""
 
 MISPLACED_TIMES, MISPLACED_ERROR = 5.0, 0.02
 """A misplaced frame disagrees with them so many times as much as frames do in the median, and by so much."""
@@ -66,7 +69,8 @@ def without_blank_frames(sequence: EndoscopicSequence) -> EndoscopicSequence:
 def without_misplaced_frames(sequence: EndoscopicSequence) -> EndoscopicSequence:
     """The sequence, its split without training frames whose pose is grossly wrong; a warning names them.
 
-    Depth that is carried to the frames that agree with it best is off by much more than that of other frames.
+    Depth that is carried to the frames that agree with it best is off by much more than that of other frames,
+    and another motion between the two cameras explains most of it.
 
     Args:
         sequence: with poses and depth of training frames, else it is returned as it is.
@@ -74,16 +78,23 @@ def without_misplaced_frames(sequence: EndoscopicSequence) -> EndoscopicSequence
     if sequence.world_from_camera is None or not sequence.training_depth_known or len(sequence.train) < 4:
         return sequence
     carried = CarriedDepth(sequence)
-    errors: dict[int, list[float]] = {}
+    errors: dict[int, list[tuple[float, Pair]]] = {}
     for pair in carried.pairs:
         error = relative_error([carried.log_ratio(pair)])
         for position in (pair.first, pair.second):
-            errors.setdefault(position, []).append(error)
-    best = {position: float(np.mean(sorted(found)[:PARTNERS])) for position, found in errors.items()}
+            errors.setdefault(position, []).append((error, pair))
+    nearest = {k: sorted(found, key=lambda item: item[0])[:PARTNERS] for k, found in errors.items()}
+    best = {k: float(np.mean([error for error, _ in found])) for k, found in nearest.items()}
     if not best:
         return sequence
     limit = max(MISPLACED_TIMES * float(np.median(list(best.values()))), MISPLACED_ERROR)
-    wrong = np.array(sorted(position for position, error in best.items() if error > limit), dtype=np.int64)
+
+    def is_explained(position: int) -> bool:
+        moved = [relative_error([carried.beyond_motion(pair)]) for _, pair in nearest[position]]
+        return float(np.mean(moved)) < EXPLAINED * best[position]
+
+    suspects = sorted(position for position, error in best.items() if error > limit)
+    wrong = np.array([position for position in suspects if is_explained(position)], dtype=np.int64)
     return _without(sequence, sequence.train[wrong], "at a place that the depth of the others contradicts")
 
 

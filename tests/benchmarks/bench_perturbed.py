@@ -1,10 +1,13 @@
-"""What veiling glare and displaced poses cost: `python -m tests.benchmarks.bench_perturbed SEQUENCE ...`.
+"""What is wrong with recordings, and its cost: `python -m tests.benchmarks.bench_perturbed SEQUENCE ...`.
 
 Each sequence is reconstructed as it is, through a lens that scatters a share of every image's mean (in
 linear light, held-out frames as well), and with training poses off by normal errors: of 1 % of the median
 depth and half a degree, times a factor. Once without the terms that meet these, and once as the profile has
 it. One line of JSON each: PSNR of held-out views as rendered, with one gain and of observed pixels, LPIPS
 where its weights are known, and what was learned. Held-out poses are exact.
+
+With `--wrong` that is one of `tests.benchmarks.wrong_recordings`, without and with the corrections of reading
+(`extrags.reading_corrections`), measured against frames and depth that are right.
 """
 
 from __future__ import annotations
@@ -21,12 +24,16 @@ from scipy.spatial.transform import Rotation
 
 from data_catalog import read
 from extrags.config import PROFILES, PipelineConfig
+from extrags.depth.estimate import estimate_depth
+from extrags.depth.training_depth import with_training_depth
 from extrags.evaluation import evaluate
 from extrags.in_memory_pipeline import run_pipeline
+from extrags.reading_corrections import with_corrections
 from extrags.sequence import EndoscopicSequence
 from extrags.training import reconstruct
 from extrags.training.pose_refinement import with_refined_poses
 from extrags.training.starting import median_depth
+from tests.benchmarks.wrong_recordings import WRONG
 
 GAMMA = 2.2
 SHIFT_SHARE, TURN_DEG = 0.01, 0.5
@@ -61,13 +68,18 @@ def cases(given: argparse.Namespace) -> Iterator[dict[str, Any]]:
         seeds = {f"{stage}.seed": given.seed for stage in stages}
         base = PROFILES[given.profile].with_overrides(seeds)
         sequence = read(name, base.ingest)
-        changed = {"as it is": sequence}
+        changed = {} if given.wrong else {"as it is": sequence}
         changed |= {f"glare of {share:g}": veiled(sequence, share) for share in given.glare}
         changed |= {f"poses off by {f:g}": displaced(sequence, f, given.seed) for f in given.pose_error}
         for change, frames in changed.items():
             for setting, overrides in (("without", WITHOUT), ("with", {})):
                 case = {"sequence": name, "change": change, "setting": setting, "seed": given.seed}
                 yield case | measured(frames, base.with_overrides(overrides), whole=given.whole)
+        for change in given.wrong:
+            wrong = WRONG[change](sequence)
+            for setting, frames in (("without", wrong), ("with", with_corrections(wrong))):
+                case = {"sequence": name, "change": change, "setting": setting, "seed": given.seed}
+                yield case | of_wrong(frames, sequence, base)
 
 
 def measured(sequence: EndoscopicSequence, config: PipelineConfig, *, whole: bool) -> dict[str, Any]:
@@ -88,6 +100,18 @@ def measured(sequence: EndoscopicSequence, config: PipelineConfig, *, whole: boo
     return case
 
 
+def of_wrong(frames: EndoscopicSequence, right: EndoscopicSequence, config: PipelineConfig) -> dict[str, Any]:
+    """Figures of the coarse scene of wrong frames, on the pictures and depth of right ones."""
+    training = frames.training_part()
+    if training.depth_error is not None:
+        training = with_training_depth(training, estimate_depth(training, config.depth, config.poses))
+    found = reconstruct(training, config.coarse)
+    frames = replace(frames, rgb=right.rgb, depth_mm=right.depth_mm, depth_error=None, withheld_depth_mm=None)
+    if found.refined is not None:
+        frames = with_refined_poses(frames, found.refined.world_from_camera)
+    return {"coarse": figures(evaluate(found.scene, frames).metrics), "train": len(training)}
+
+
 def figures(metrics: dict[str, Any]) -> dict[str, Any]:
     observed = metrics.get("observed") or {}
     return {
@@ -105,9 +129,12 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--glare", nargs="*", type=float, default=[0.15])
     parser.add_argument("--pose-error", nargs="*", type=float, default=[1.0])
+    parser.add_argument("--wrong", nargs="*", default=[], choices=list(WRONG), help="in place of both")
     parser.add_argument("--whole", action="store_true", help="whole runs, not coarse scenes alone")
     parser.add_argument("--json", metavar="FILE")
     given = parser.parse_args()
+    if given.wrong:
+        given.glare, given.pose_error = [], []
     found = []
     for case in cases(given):
         found.append(case)

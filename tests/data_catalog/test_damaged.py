@@ -86,5 +86,5 @@ def test_there_are_enough_of_them() -> None:
 )
 def test_the_good_ones_are_good(good, layout) -> None:
     inspection = inspect(good[layout])
-    expected = {"depth resolution"} if layout == "endonerf" else set()
+    expected = {"depth resolution", "depth and poses"} if layout == "endonerf" else set()
     assert {finding.topic for finding in inspection.findings} <= expected, inspection.findings

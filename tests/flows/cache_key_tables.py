@@ -149,6 +149,7 @@ DIRECTLY: dict[str, tuple[str, ...]] = {
 OTHERS: dict[str, Any] = {
     "enhance.crop": 104,
     "ingest.downscale": 4,
+    "ingest.depth_error": 0.1,
     "ingest.calibration": None,
     "depth.completion": None,
     "depth.monocular": None,

@@ -114,7 +114,10 @@ def test_the_working_distance_is_the_median_of_dense_depth(share: float, unit: f
     assert after.scale_words == "millimetres from the working distance given"
     assert after.depth_mm is not None
     assert given.depth_mm is not None
-    np.testing.assert_allclose(after.depth_mm, given.depth_mm * unit, rtol=0.02)
+    # Single pixels whose depth is unlike that of all round them are taken for speckles.
+    kept = (after.depth_mm > 0) | (given.depth_mm == 0)
+    assert kept.mean() > 0.97
+    np.testing.assert_allclose(after.depth_mm[kept], given.depth_mm[kept] * unit, rtol=0.02)
     assert np.ptp(after.cameras.centers[:, 0]) == pytest.approx(2 * unit, rel=0.02)
 
 

@@ -1,0 +1,103 @@
+"""Recordings as a sensor, a tracker, a calibration or a recorder get them wrong, by known amounts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from extrags.cameras import pixel_rays
+from extrags.sequence import EndoscopicSequence
+
+__all__ = ["WRONG"]
+
+Sequence = EndoscopicSequence
+
+
+def _depths(sequence: Sequence, changed: Callable[[int, np.ndarray], np.ndarray]) -> Sequence:
+    assert sequence.depth_mm is not None
+    depth = [np.where(d > 0, changed(k, d), 0) for k, d in enumerate(sequence.depth_mm)]
+    return replace(sequence, depth_mm=np.stack(depth).astype(np.float32))
+
+
+def _smooth(frame: int, depth: np.ndarray, share: float = 0.05) -> np.ndarray:
+    noise = np.random.default_rng([500, frame]).normal(size=depth.shape)
+    field = cv2.GaussianBlur(noise, (0, 0), 0.2 * depth.shape[1])
+    return np.asarray(depth * np.exp(share * field / field.std()))
+
+
+def _monocular(frame: int, depth: np.ndarray) -> np.ndarray:
+    scale, shift = np.random.default_rng([501, frame]).normal(scale=0.05, size=2)
+    inverse = 1 / np.maximum(depth, 1e-6)
+    moved = np.exp(scale) * inverse + shift * np.median(inverse[depth > 0])
+    return _smooth(frame, 1 / np.maximum(moved, 0.05 * inverse))
+
+
+def _of_frames(frame: int, depth: np.ndarray) -> np.ndarray:
+    return np.asarray(depth * np.exp(0.05 * np.random.default_rng([502, frame]).normal()))
+
+
+def _noisy(frame: int, depth: np.ndarray) -> np.ndarray:
+    return np.asarray(
+        depth * np.exp(np.random.default_rng([503, frame]).normal(scale=0.05, size=depth.shape))
+    )
+
+
+def _speckled(frame: int, depth: np.ndarray) -> np.ndarray:
+    generator = np.random.default_rng([504, frame])
+    anything = generator.uniform(0.2, 2.5, depth.shape) * np.median(depth[depth > 0])
+    return np.where(generator.random(depth.shape) < 0.1, anything, depth)
+
+
+def _along_ray(sequence: Sequence) -> Sequence:
+    lengths = np.linalg.norm(pixel_rays(sequence.cameras), axis=-1)
+    return _depths(sequence, lambda frame, depth: depth * lengths[frame])
+
+
+def _lens(sequence: Sequence, focal: float = 1.0, shift_px: tuple[float, float] = (0.0, 0.0)) -> Sequence:
+    K = sequence.K.copy()
+    K[:, :2, :2] *= focal
+    K[:, :2, 2] += shift_px
+    return replace(sequence, K=K)
+
+
+def _hand_eye(sequence: Sequence) -> Sequence:
+    further = np.eye(4)
+    further[:3, 3] = 1.6, -1.2, 0.0
+    return replace(sequence, world_from_camera=sequence.cameras.world_from_camera @ further)
+
+
+def _blank(sequence: Sequence) -> Sequence:
+    rgb = np.array(sequence.rgb)
+    rgb[np.sort(sequence.train)[4::8]] = 0
+    return replace(sequence, rgb=rgb)
+
+
+def _misplaced(sequence: Sequence) -> Sequence:
+    poses, generator = sequence.cameras.world_from_camera.copy(), np.random.default_rng(3)
+    for frame in np.sort(sequence.train)[5::10]:
+        turn, shift = (axis / np.linalg.norm(axis) for axis in generator.normal(size=(2, 3)))
+        poses[frame, :3, :3] = poses[frame, :3, :3] @ Rotation.from_rotvec(np.radians(5) * turn).as_matrix()
+        poses[frame, :3, 3] += 5 * shift
+    return replace(sequence, world_from_camera=poses)
+
+
+WRONG: dict[str, Callable[[Sequence], Sequence]] = {
+    "smooth": lambda sequence: _depths(sequence, _smooth),
+    "frames": lambda sequence: _depths(sequence, _of_frames),
+    "monocular": lambda sequence: _depths(sequence, _monocular),
+    "noise": lambda sequence: _depths(sequence, _noisy),
+    "speckles": lambda sequence: _depths(sequence, _speckled),
+    "unit": lambda sequence: _depths(sequence, lambda _, depth: 1.1 * depth),
+    "offset": lambda sequence: _depths(sequence, lambda _, depth: depth + 2),
+    "ray": _along_ray,
+    "focal": lambda sequence: _lens(sequence, 1.05),
+    "principal": lambda sequence: _lens(sequence, shift_px=(1.6, 1.2)),
+    "hand-eye": _hand_eye,
+    "blank": _blank,
+    "misplaced": _misplaced,
+}
+"""What is wrong, by its name on the command line."""
