@@ -161,7 +161,7 @@ def _images(sequence: EndoscopicSequence) -> Iterator[Finding]:
         yield warning(
             "black frame",
             f"mean brightness {means[index]:.1f} of 255 inside the mask; {int((means < _BLACK).sum())} of "
-            f"{len(means)} frames are like that. Leave them out",
+            f"{len(means)} frames are like that. A run leaves them out where they are few",
             frame=sequence.frame_name(int(index)),
             field="rgb",
         )

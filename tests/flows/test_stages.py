@@ -57,6 +57,21 @@ def test_stages_run_their_own_tasks(outcome: SequenceOutcome) -> None:
         assert ran[stage.name] - shared == own - shared - ELSEWHERE
 
 
+@pytest.mark.parametrize(("error", "estimated"), [(0.0, False), (0.05, True)])
+def test_depth_is_estimated_beside_depth_that_frames_disagree_about(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: float, estimated: bool
+) -> None:
+    (tmp_path / "lpips_alex_v0.1.npz").write_bytes(b"alex")
+    monkeypatch.setenv("EXTRAGS_LPIPS_WEIGHTS", str(tmp_path))
+    config = PipelineConfig().with_overrides({"device": "cpu", "evaluate.lpips_nets": ("alex",)})
+    recorded = RecordedRun(has_poses=True, has_depth=True, judgement=KEPT)
+    recorded.counts["depth_error"] = error
+    recorded_run(SEQUENCE, config, recorded)
+    assert ("depth" in recorded.keys) == estimated
+    # Later stages are given frames with the result.
+    assert ("depth-frames" in recorded.keys) == estimated
+
+
 def test_runs_keep_the_artefacts_of_their_stages(outcome: SequenceOutcome) -> None:
     described = [part for stage in REGISTRY for part in (*stage.page_parts, *stage.other_parts)]
     assert sorted(outcome.refs) == sorted(described)
