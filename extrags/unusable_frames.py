@@ -63,7 +63,7 @@ def without_blank_frames(sequence: EndoscopicSequence) -> EndoscopicSequence:
     blank = np.array(
         [shows_nothing(rgb, mask) for rgb, mask in zip(sequence.rgb, sequence.mask, strict=True)], dtype=bool
     )
-    return _without(sequence, np.flatnonzero(blank), "black, or of one colour")
+    return _without(sequence, np.flatnonzero(blank), "black, or of one colour", "rgb")
 
 
 def without_misplaced_frames(sequence: EndoscopicSequence) -> EndoscopicSequence:
@@ -95,10 +95,13 @@ def without_misplaced_frames(sequence: EndoscopicSequence) -> EndoscopicSequence
 
     suspects = sorted(position for position, error in best.items() if error > limit)
     wrong = np.array([position for position in suspects if is_explained(position)], dtype=np.int64)
-    return _without(sequence, sequence.train[wrong], "at a place that the depth of the others contradicts")
+    what = "at a place that the depth of the others contradicts"
+    return _without(sequence, sequence.train[wrong], what, "world_from_camera")
 
 
-def _without(sequence: EndoscopicSequence, frames: Int[np.ndarray, "n"], what: str) -> EndoscopicSequence:
+def _without(
+    sequence: EndoscopicSequence, frames: Int[np.ndarray, "n"], what: str, field: str
+) -> EndoscopicSequence:
     """With a split that does not name these frames."""
     split = sequence.split
     train, test = (np.setdiff1d(part, frames) for part in (split.train, split.test))
@@ -115,6 +118,6 @@ def _without(sequence: EndoscopicSequence, frames: Int[np.ndarray, "n"], what: s
         len(split.train) + len(split.test),
         sequence.frame_name(int(gone[0])),
         what,
-        extra={"topic": "unusable frames"},
+        extra={"topic": "unusable frames", "field": field},
     )
     return replace(sequence, split=Split(split.name, train, test, split.version))
