@@ -123,10 +123,25 @@ class CarriedDepth:
         K[:, :2, 2] += 0.5
         height, width = self.sequence.mask[0][self._kept].shape
         self.cameras = Cameras(K, cameras.world_from_camera, width, height, cameras.lens)
+        self._ratios: dict[Pair, Float[np.ndarray, "p"]] = {}
         self._inverse_depth: dict[int, Float[np.ndarray, "h w"]] = {}
         self._pixels: dict[int, tuple[Float[np.ndarray, "p 2"], Float[np.ndarray, "p"]]] = {}
         self.typical = np.array([_median(self.known(k)) for k in range(len(self.cameras))])
         self.pairs = self._found_pairs()
+
+    @classmethod
+    def of(cls, sequence: EndoscopicSequence) -> CarriedDepth | None:
+        """That of a sequence; None without poses or measured depth of two frames that share a surface."""
+        if sequence.world_from_camera is None or sequence.depth_error is not None or len(sequence.train) < 2:
+            return None
+        if not sequence.training_depth_known:
+            return None
+        carried = cls(sequence)
+        return carried if carried.pairs else None
+
+    def ratio(self, pair: Pair) -> Float[np.ndarray, "p"]:
+        """`log_ratio` of one of the pairs, with everything as it is given."""
+        return self._ratios[pair]
 
     def known(self, position: int) -> Float[np.ndarray, "h w"]:
         """Depth of a training frame inside its mask, else 0, at the pixels that are kept."""
@@ -205,7 +220,7 @@ class CarriedDepth:
         hold for any lens.
         """
         motion, length = self.motion(pair), float(self.typical[pair.first])
-        best = ratio = self.log_ratio(pair)
+        best = ratio = self.ratio(pair)
         for _ in range(ROUNDS):
             steps = STEP * np.eye(6)
             moved = [self.log_ratio(pair, motion=_moved(motion, step, length)) for step in steps]
@@ -236,7 +251,9 @@ class CarriedDepth:
         for position in chosen.tolist():
             for other in sources[position][sources[position] >= 0].tolist():
                 pair = Pair(position, other)
-                if np.isfinite(self.log_ratio(pair)).sum() >= LEAST_POINTS:
+                ratio = self.log_ratio(pair)
+                if np.isfinite(ratio).sum() >= LEAST_POINTS:
+                    self._ratios[pair] = ratio
                     found.append(pair)
         return found
 

@@ -53,21 +53,9 @@ class MeasuredDepthError:
     pairs: int
 
 
-def measured_depth_error(sequence: EndoscopicSequence) -> MeasuredDepthError | None:
-    """How far training frames disagree about their depth.
-
-    Args:
-        sequence: with poses and depth of training frames.
-
-    Returns:
-        None without poses or depth, or where no two frames see enough of the same surface.
-    """
-    if sequence.world_from_camera is None or not sequence.training_depth_known or len(sequence.train) < 2:
-        return None
-    carried = CarriedDepth(sequence)
-    if not carried.pairs:
-        return None
-    ratios = [carried.log_ratio(pair) for pair in carried.pairs]
+def measured_depth_error(carried: CarriedDepth) -> MeasuredDepthError:
+    """How far training frames disagree about their depth."""
+    ratios = [carried.ratio(pair) for pair in carried.pairs]
     error = beyond = relative_error(ratios)
     if error > EXACT:
         some = evenly(len(carried.pairs), FITTED_PAIRS).tolist()
@@ -82,7 +70,7 @@ def measured_depth_error(sequence: EndoscopicSequence) -> MeasuredDepthError | N
 
 
 def with_depth_error(
-    sequence: EndoscopicSequence, error: float | Literal["auto"] = "auto"
+    sequence: EndoscopicSequence, carried: CarriedDepth | None, error: float | Literal["auto"] = "auto"
 ) -> EndoscopicSequence:
     """The sequence, its measured depth with the error that frames find in it.
 
@@ -93,13 +81,14 @@ def with_depth_error(
 
     Args:
         sequence: in the unit of its poses.
+        carried: its depth; None where frames tell nothing of each other's.
         error: relative error of all depth; auto: as training frames tell, frame by frame.
     """
     if sequence.depth_mm is None or sequence.depth_error is not None or not sequence.training_depth_known:
         return sequence
     if error != "auto":
         return _uncertain(sequence, np.full(len(sequence.train), error)) if error > 0 else sequence
-    found = measured_depth_error(sequence)
+    found = None if carried is None else measured_depth_error(carried)
     if found is None or found.beyond_motion < LEAST_ERROR:
         return sequence
     _log.warning(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from extrags.carried_depth import CarriedDepth
 from extrags.config import IngestConfig
 from extrags.depth_noise import with_clean_depth
 from extrags.measured_depth import as_given, with_depth_error
@@ -32,7 +33,12 @@ def with_corrections(sequence: EndoscopicSequence, config: IngestConfig | None =
     sequence = without_scarce_depth(sequence)
     if config.depth_error == "auto":
         sequence = with_clean_depth(sequence)
+    carried = CarriedDepth.of(sequence)
     if config.correct_calibration:
-        sequence = with_calibration_corrected(sequence, lens=config.calibration is None)
-    sequence = without_misplaced_frames(sequence)
-    return with_depth_error(sequence, config.depth_error)
+        given, lens = sequence, config.calibration is None
+        sequence = with_calibration_corrected(given, carried, lens=lens)
+        carried = carried if sequence is given else CarriedDepth.of(sequence)
+    given = sequence
+    sequence = without_misplaced_frames(given, carried)
+    carried = carried if sequence is given else CarriedDepth.of(sequence)
+    return with_depth_error(sequence, carried, config.depth_error)

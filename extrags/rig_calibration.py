@@ -115,7 +115,9 @@ def _families(length: float) -> tuple[_Family, ...]:
     )
 
 
-def with_calibration_corrected(sequence: EndoscopicSequence, *, lens: bool = True) -> EndoscopicSequence:
+def with_calibration_corrected(
+    sequence: EndoscopicSequence, carried: CarriedDepth | None, *, lens: bool = True
+) -> EndoscopicSequence:
     """The sequence with what its frames have in common corrected, where their depth tells it clearly.
 
     Depth along the ray becomes z-depth. Of depth's unit and offset, of focal lengths and principal point, and
@@ -125,27 +127,23 @@ def with_calibration_corrected(sequence: EndoscopicSequence, *, lens: bool = Tru
     The sequence is returned as it is where nothing is off, or nothing of this explains it.
 
     Args:
-        sequence: with poses and depth of training frames.
+        sequence: in any unit.
+        carried: its depth; None where frames tell nothing of each other's.
         lens: whether the lens may be what is off.
     """
-    if sequence.world_from_camera is None or not sequence.training_depth_known or len(sequence.train) < 2:
-        return sequence
-    if sequence.depth_error is not None:
-        return sequence
     for _ in range(CORRECTIONS):
-        corrected = _corrected_once(sequence, lens)
+        if carried is None:
+            break
+        corrected = _corrected_once(sequence, carried, lens)
         if corrected is sequence:
             break
-        sequence = corrected
+        sequence, carried = corrected, CarriedDepth.of(corrected)
     return sequence
 
 
-def _corrected_once(sequence: EndoscopicSequence, lens: bool) -> EndoscopicSequence:
-    carried = CarriedDepth(sequence)
-    if not carried.pairs:
-        return sequence
+def _corrected_once(sequence: EndoscopicSequence, carried: CarriedDepth, lens: bool) -> EndoscopicSequence:
     pairs = [carried.pairs[k] for k in evenly(len(carried.pairs), FITTED_PAIRS).tolist()]
-    error = relative_error([carried.log_ratio(pair) for pair in pairs])
+    error = relative_error([carried.ratio(pair) for pair in pairs])
     if error < LEAST_ERROR:
         return sequence
     along_ray = relative_error([carried.log_ratio(pair, along_ray=True) for pair in pairs])

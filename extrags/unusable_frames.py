@@ -22,7 +22,7 @@ DARK = 20
 UNIFORM = 10
 """Spread of each channel of 255, below which a frame has one colour: a lens on the wall, or covered."""
 
-LOOKED_AT_PX = 20_000
+LOOKED_AT_PX = 5_000
 """Pixels of a frame that tell, about."""
 
 HARDLY = 2.0
@@ -66,27 +66,27 @@ def without_blank_frames(sequence: EndoscopicSequence) -> EndoscopicSequence:
     return _without(sequence, np.flatnonzero(blank), "black, or of one colour", "rgb")
 
 
-def without_misplaced_frames(sequence: EndoscopicSequence) -> EndoscopicSequence:
+def without_misplaced_frames(
+    sequence: EndoscopicSequence, carried: CarriedDepth | None
+) -> EndoscopicSequence:
     """The sequence, its split without training frames whose pose is grossly wrong; a warning names them.
 
     Depth that is carried to the frames that agree with it best is off by much more than that of other frames,
     and another motion between the two cameras explains most of it.
 
     Args:
-        sequence: with poses and depth of training frames, else it is returned as it is.
+        sequence: with at least four training frames, else it is returned as it is.
+        carried: its depth; None where nothing can be told.
     """
-    if sequence.world_from_camera is None or not sequence.training_depth_known or len(sequence.train) < 4:
+    if carried is None or len(sequence.train) < 4:
         return sequence
-    carried = CarriedDepth(sequence)
     errors: dict[int, list[tuple[float, Pair]]] = {}
     for pair in carried.pairs:
-        error = relative_error([carried.log_ratio(pair)])
+        error = relative_error([carried.ratio(pair)])
         for position in (pair.first, pair.second):
             errors.setdefault(position, []).append((error, pair))
     nearest = {k: sorted(found, key=lambda item: item[0])[:PARTNERS] for k, found in errors.items()}
     best = {k: float(np.mean([error for error, _ in found])) for k, found in nearest.items()}
-    if not best:
-        return sequence
     limit = max(MISPLACED_TIMES * float(np.median(list(best.values()))), MISPLACED_ERROR)
 
     def is_explained(position: int) -> bool:

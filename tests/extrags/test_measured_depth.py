@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -11,12 +12,26 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import extrags
-from extrags.measured_depth import as_given, measured_depth_error, with_depth_error
+from extrags.carried_depth import CarriedDepth
+from extrags.measured_depth import MeasuredDepthError, as_given
+from extrags.measured_depth import measured_depth_error as error_of
+from extrags.measured_depth import with_depth_error as with_error
 from extrags.sequence import EndoscopicSequence, Split
 from extrags.training.reconstruction import refines_poses
 from tests.extrags.depth.withheld import recorded
 
 Change = Callable[[int, np.ndarray], np.ndarray]
+
+
+def measured_depth_error(sequence: EndoscopicSequence) -> MeasuredDepthError | None:
+    carried = CarriedDepth.of(sequence)
+    return None if carried is None else error_of(carried)
+
+
+def with_depth_error(
+    sequence: EndoscopicSequence, error: float | Literal["auto"] = "auto"
+) -> EndoscopicSequence:
+    return with_error(sequence, CarriedDepth.of(sequence), error)
 
 
 @pytest.fixture(scope="module")

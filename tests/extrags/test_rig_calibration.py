@@ -11,10 +11,14 @@ from scipy.spatial.transform import Rotation
 
 from extrags.cameras import pixel_rays
 from extrags.carried_depth import CarriedDepth, Correction, relative_error
-from extrags.rig_calibration import with_calibration_corrected
+from extrags.rig_calibration import with_calibration_corrected as corrected
 from extrags.sequence import EndoscopicSequence
 from tests.extrags.depth.withheld import recorded
 from tests.extrags.test_measured_depth import displaced, smoothly_wrong, with_depth
+
+
+def with_calibration_corrected(sequence: EndoscopicSequence) -> EndoscopicSequence:
+    return corrected(sequence, CarriedDepth.of(sequence))
 
 
 @pytest.fixture(scope="module")

@@ -8,12 +8,18 @@ import numpy as np
 import pytest
 
 import extrags
+from extrags.carried_depth import CarriedDepth
 from extrags.sequence import EndoscopicSequence
-from extrags.unusable_frames import shows_nothing, without_blank_frames, without_misplaced_frames
+from extrags.unusable_frames import shows_nothing, without_blank_frames
+from extrags.unusable_frames import without_misplaced_frames as without_misplaced
 from tests.extrags.depth.withheld import recorded
 from tests.extrags.test_measured_depth import displaced
 
 SIZE = (40, 50)
+
+
+def without_misplaced_frames(sequence: EndoscopicSequence) -> EndoscopicSequence:
+    return without_misplaced(sequence, CarriedDepth.of(sequence))
 
 
 @pytest.fixture(scope="module")

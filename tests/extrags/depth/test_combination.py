@@ -11,9 +11,8 @@ from extrags.config import DepthConfig
 from extrags.depth.combination import Depth, combined
 from extrags.depth.estimate import estimate_depth
 from extrags.depth.training_depth import with_training_depth
-from extrags.measured_depth import with_depth_error
 from tests.extrags.depth.withheld import recorded, true_training_depth, with_points, withheld_phantom
-from tests.extrags.test_measured_depth import smoothly_wrong, with_depth
+from tests.extrags.test_measured_depth import smoothly_wrong, with_depth, with_depth_error
 
 SIZE = (60, 80)
 

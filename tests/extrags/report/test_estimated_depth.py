@@ -119,7 +119,7 @@ def test_measured_depth_that_was_corrected_stands_beside_it(
     sequence: EndoscopicSequence, estimate: Estimate
 ) -> None:
     told = {**estimate.report, "combined_with_measured": True, "median_measured_error": 0.045}
-    given = with_depth_error(sequence, 0.045)
+    given = with_depth_error(sequence, None, 0.045)
     inputs = ReportInputs(name="tube", sequence=given, depth=replace(estimate, report=told))
     page = Page(build_report(inputs, CONFIG))
     for words in (
