@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from extrags.cameras import Cameras, project_points, transform_points, unproject_pixels
 from extrags.sequence import EndoscopicSequence
@@ -33,6 +32,9 @@ POINTS = 1500
 
 LEAST_POINTS = 100
 """Points that meet depth in the other frame, below which a pair tells nothing."""
+
+LEAST_PAIRS = 12
+"""Pairs below which a few that see the two sides of a fold decide; five frames have as many, mostly."""
 
 SAME_SURFACE = 0.5
 """Log-ratio of depths beyond which a point is hidden by another surface."""
@@ -85,6 +87,8 @@ class Correction:
 
     def of_poses(self, world_from_camera: Float[np.ndarray, "*b 4 4"]) -> Float[np.ndarray, "*b 4 4"]:
         """Corrected poses."""
+        from scipy.spatial.transform import Rotation
+
         further = np.eye(4)
         further[:3, :3] = Rotation.from_rotvec(self.turn).as_matrix()
         further[:3, 3] = self.move
@@ -131,13 +135,13 @@ class CarriedDepth:
 
     @classmethod
     def of(cls, sequence: EndoscopicSequence) -> CarriedDepth | None:
-        """That of a sequence; None without poses or measured depth of two frames that share a surface."""
+        """That of a sequence; None without poses or measured depth, or where few pairs share a surface."""
         if sequence.world_from_camera is None or sequence.depth_error is not None or len(sequence.train) < 2:
             return None
         if not sequence.training_depth_known:
             return None
         carried = cls(sequence)
-        return carried if carried.pairs else None
+        return carried if len(carried.pairs) >= LEAST_PAIRS else None
 
     def ratio(self, pair: Pair) -> Float[np.ndarray, "p"]:
         """`log_ratio` of one of the pairs, with everything as it is given."""
@@ -280,6 +284,8 @@ def _moved(
     motion: Float[np.ndarray, "4 4"], step: Float[np.ndarray, "6"], length: float
 ) -> Float[np.ndarray, "4 4"]:
     """A motion, then a turn in radians and a shift in `length`, of the second camera's axes."""
+    from scipy.spatial.transform import Rotation
+
     further = np.eye(4)
     further[:3, :3] = Rotation.from_rotvec(step[:3]).as_matrix()
     further[:3, 3] = length * step[3:]
@@ -287,9 +293,17 @@ def _moved(
 
 
 def relative_error(ratios: list[Float[np.ndarray, "_"]]) -> float:
-    """Relative error of depth that explains log-ratios, a median; NaN among them does not count."""
-    known = np.concatenate([ratio[np.isfinite(ratio)] for ratio in ratios]) if ratios else np.zeros(0)
-    return float(np.median(np.abs(known)) / MEDIAN) if len(known) else 0.0
+    """Relative error of depth that explains log-ratios, a median.
+
+    Of points that the other frame looks through alone (a ratio above 0): those behind its surface may be
+    hidden by it, and most are where two frames see the two sides of a fold. An error of either frame makes as
+    many of the one as of the other, in one direction of a pair or in both. NaN does not count.
+
+    Args:
+        ratios: from `CarriedDepth.log_ratio`.
+    """
+    known = np.concatenate([ratio[ratio > 0] for ratio in ratios]) if ratios else np.zeros(0)
+    return float(np.median(known) / MEDIAN) if len(known) else 0.0
 
 
 def evenly(count: int, at_most: int) -> np.ndarray:

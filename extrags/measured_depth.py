@@ -24,10 +24,10 @@ __all__ = ["MeasuredDepthError", "as_given", "measured_depth_error", "with_depth
 
 _log = logging.getLogger(__name__)
 
-LEAST_ERROR = 0.01
+LEAST_ERROR = 0.0075
 """Of depth, beyond any motion of the frames, from which on it is not taken as it is. Exact depth has at most
-0.0003, in steps of eight bits 0.007, with poses that are off by 2 % of the depth and a degree 0.002, with a
-focal length that is off by 5 % 0.002; smooth errors of 2 % 0.011 to 0.016 (docs/experiments/depth.md)."""
+0.0003, in steps of eight bits 0.005, with poses that are off by 3 % of the depth and 1.5 degrees 0.001, with
+a focal length that is off by 5 % 0.002; smooth errors of 2 % 0.0085 to 0.009 (docs/experiments/depth.md)."""
 
 EXACT = 0.003
 """Error of depth that is not looked into any further."""
@@ -61,8 +61,12 @@ def measured_depth_error(carried: CarriedDepth) -> MeasuredDepthError:
         some = evenly(len(carried.pairs), FITTED_PAIRS).tolist()
         beyond = relative_error([carried.beyond_motion(carried.pairs[k]) for k in some])
     of_frame = np.full(len(carried.cameras), error)
-    for position in {pair.first for pair in carried.pairs}:
-        own = [r for pair, r in zip(carried.pairs, ratios, strict=True) if pair.first == position]
+    compared = zip(carried.pairs, ratios, strict=True)
+    of_pairs: dict[int, list[Float[np.ndarray, "_"]]] = {}
+    for pair, ratio in compared:
+        for position in (pair.first, pair.second):
+            of_pairs.setdefault(position, []).append(ratio)
+    for position, own in of_pairs.items():
         # The difference has the error of the other frame in it, which is taken to be as large as most are.
         square = 2 * relative_error(own) ** 2 - error**2
         of_frame[position] = np.sqrt(max(square, (error / 2) ** 2))

@@ -6,9 +6,9 @@ import logging
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
-from extrags.carried_depth import CarriedDepth, Pair, relative_error
+from extrags.carried_depth import CarriedDepth, Pair
 from extrags.sequence import EndoscopicSequence
 from extrags.splits import Split
 
@@ -82,7 +82,7 @@ def without_misplaced_frames(
         return sequence
     errors: dict[int, list[tuple[float, Pair]]] = {}
     for pair in carried.pairs:
-        error = relative_error([carried.ratio(pair)])
+        error = _difference(carried.ratio(pair))
         for position in (pair.first, pair.second):
             errors.setdefault(position, []).append((error, pair))
     nearest = {k: sorted(found, key=lambda item: item[0])[:PARTNERS] for k, found in errors.items()}
@@ -90,13 +90,18 @@ def without_misplaced_frames(
     limit = max(MISPLACED_TIMES * float(np.median(list(best.values()))), MISPLACED_ERROR)
 
     def is_explained(position: int) -> bool:
-        moved = [relative_error([carried.beyond_motion(pair)]) for _, pair in nearest[position]]
+        moved = [_difference(carried.beyond_motion(pair)) for _, pair in nearest[position]]
         return float(np.mean(moved)) < EXPLAINED * best[position]
 
     suspects = sorted(position for position, error in best.items() if error > limit)
     wrong = np.array([position for position in suspects if is_explained(position)], dtype=np.int64)
     what = "at a place that the depth of the others contradicts"
     return _without(sequence, sequence.train[wrong], what, "world_from_camera")
+
+
+def _difference(ratio: Float[np.ndarray, "p"]) -> float:
+    """Median of how far depths differ, in front and behind."""
+    return float(np.nanmedian(np.abs(ratio)))
 
 
 def _without(

@@ -33,11 +33,12 @@ def sole_training(folder: Path) -> Iterator[None]:
     taken = True
     try:
         free = locks.acquire_lock("pretrain", holder, acquire_timeout=0.0)
-    except StoreError as error:
-        raise ConfigError(f"--output {folder}: {error}") from error
     except OSError as error:
+        cause = error.__cause__ if isinstance(error, StoreError) else error
+        if isinstance(cause, PermissionError) or not isinstance(cause, OSError):
+            raise ConfigError(f"--output {folder}: {error}") from error
         # File systems without locks are no reason not to train.
-        logger.warning("%s cannot be locked against a second training: %s", folder, reason_of(error))
+        logger.warning("%s cannot be locked against a second training: %s", folder, reason_of(cause))
         free, taken = True, False
     if not free:
         raise ConfigError(

@@ -134,8 +134,8 @@ def test_larger_maps_are_looked_up_at_every_other_pixel(exact: EndoscopicSequenc
 def test_corrections_keep_what_is_unknown_and_undo_each_other(exact: EndoscopicSequence) -> None:
     depth = np.array([0.0, 1.0, 30.0])
     assert Correction(offset=-2.0).of_depth(depth).tolist() == [0, 0, 28]
-    there = Correction(log_focal=(0.1, 0.2), shift=(0.01, 0.02)).of_intrinsics(exact.K, exact.width)
-    back = Correction(log_focal=(-0.1, -0.2), shift=(-0.01, -0.02)).of_intrinsics(there, exact.width)
+    there = Correction(log_focal=(0.1, 0.2), shift=(0.01, 0.02)).of_intrinsics(exact.K, 96.0)
+    back = Correction(log_focal=(-0.1, -0.2), shift=(-0.01, -0.02)).of_intrinsics(there, 96.0)
     np.testing.assert_allclose(back, exact.K, rtol=1e-12)
     poses = exact.cameras.world_from_camera
     turned = Correction(turn=(0.1, 0, 0)).of_poses(Correction(turn=(-0.1, 0, 0)).of_poses(poses))
