@@ -30,16 +30,19 @@ def sole_training(folder: Path) -> Iterator[None]:
     from tasks.locks import FlockManager
 
     locks, holder = FlockManager(folder), uuid4().hex
-    taken = True
+    free, without_locks = True, ""
     try:
         free = locks.acquire_lock("pretrain", holder, acquire_timeout=0.0)
-    except OSError as error:
-        cause = error.__cause__ if isinstance(error, StoreError) else error
+    except StoreError as error:
+        cause = error.__cause__
         if isinstance(cause, PermissionError) or not isinstance(cause, OSError):
             raise ConfigError(f"--output {folder}: {error}") from error
+        without_locks = reason_of(cause)
+    except OSError as error:
+        without_locks = reason_of(error)
+    if without_locks:
         # File systems without locks are no reason not to train.
-        logger.warning("%s cannot be locked against a second training: %s", folder, reason_of(cause))
-        free, taken = True, False
+        logger.warning("%s cannot be locked against a second training: %s", folder, without_locks)
     if not free:
         raise ConfigError(
             f"--output {folder}: another training writes there now, and the two would spoil each other's "
@@ -48,7 +51,7 @@ def sole_training(folder: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        if taken:
+        if not without_locks:
             locks.release_lock("pretrain", holder)
 
 
