@@ -135,7 +135,14 @@ class CarriedDepth:
 
     @classmethod
     def of(cls, sequence: EndoscopicSequence) -> CarriedDepth | None:
-        """That of a sequence; None without poses or measured depth, or where few pairs share a surface."""
+        """That of a sequence.
+
+        Args:
+            sequence: with or without poses and depth.
+
+        Returns:
+            None without poses or measured depth, and where fewer than `LEAST_PAIRS` pairs share a surface.
+        """
         if sequence.world_from_camera is None or sequence.depth_error is not None or len(sequence.train) < 2:
             return None
         if not sequence.training_depth_known:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+from collections.abc import Iterator
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
 from extrags.carried_depth import evenly
-from extrags.frame_stacks import stacked
 from extrags.sequence import EndoscopicSequence
 
 __all__ = ["noise_level", "smoothed", "speckles", "with_clean_depth"]
@@ -68,6 +66,13 @@ def with_clean_depth(sequence: EndoscopicSequence) -> EndoscopicSequence:
         counts += np.array([np.count_nonzero(speckles(depth)), np.count_nonzero(depth > 0)])
     share = counts[0] / max(1, counts[1])
     if share > MOST_SPECKLES:
+        _log.warning(
+            "%s: %.0f %% of the depths of training frames are like too few of their neighbours, more than "
+            "speckles can be; depth is left as it is. Is it of these frames?",
+            sequence.name,
+            100 * share,
+            extra=_TOPIC,
+        )
         return sequence
     if share >= LEAST_SPECKLES:
         _log.warning(
@@ -77,9 +82,7 @@ def with_clean_depth(sequence: EndoscopicSequence) -> EndoscopicSequence:
             100 * share,
             extra=_TOPIC,
         )
-        sequence = _with_depth(
-            sequence, lambda depth: np.where(speckles(depth), 0, depth).astype(depth.dtype)
-        )
+        sequence = sequence.with_changed_depth(lambda _, depth: np.where(speckles(depth), 0, depth))
     assert sequence.depth_mm is not None
     depths = sequence.depth_mm
     noise = float(np.median([noise_level(depths[frame]) for frame in looked_at]))
@@ -92,7 +95,7 @@ def with_clean_depth(sequence: EndoscopicSequence) -> EndoscopicSequence:
         2 * REACH + 1,
         extra=_TOPIC,
     )
-    return _with_depth(sequence, lambda depth: smoothed(depth, noise))
+    return sequence.with_changed_depth(lambda _, depth: smoothed(depth, noise))
 
 
 def speckles(depth: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
@@ -165,18 +168,3 @@ def _around(reach: int, *images: np.ndarray) -> Iterator[tuple[float, list[np.nd
             if (row, column) != (reach, reach):
                 there = slice(row, row + height), slice(column, column + width)
                 yield float(np.hypot(row - reach, column - reach)), [image[there] for image in padded]
-
-
-def _with_depth(
-    sequence: EndoscopicSequence, changed: Callable[[np.ndarray], np.ndarray]
-) -> EndoscopicSequence:
-    """With all depth changed, frame by frame."""
-
-    def of_all(depth_mm: np.ndarray | None) -> np.ndarray | None:
-        return None if depth_mm is None else stacked((changed(depth) for depth in depth_mm), len(depth_mm))
-
-    return replace(
-        sequence,
-        depth_mm=of_all(sequence.depth_mm),
-        withheld_depth_mm=of_all(sequence.withheld_depth_mm),
-    )

@@ -54,7 +54,11 @@ class MeasuredDepthError:
 
 
 def measured_depth_error(carried: CarriedDepth) -> MeasuredDepthError:
-    """How far training frames disagree about their depth."""
+    """How far training frames disagree about their depth.
+
+    Args:
+        carried: depth of a sequence's training frames.
+    """
     ratios = [carried.ratio(pair) for pair in carried.pairs]
     error = beyond = relative_error(ratios)
     if error > EXACT:

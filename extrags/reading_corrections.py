@@ -1,4 +1,4 @@
-"""What is mended of every sequence that was read, before any stage sees it."""
+"""What is corrected of every sequence that was read, before any stage sees it."""
 
 from __future__ import annotations
 

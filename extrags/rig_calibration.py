@@ -15,8 +15,15 @@ import numpy as np
 from jaxtyping import Float
 
 from extrags.cameras import unproject_pixels
-from extrags.carried_depth import MEDIAN, CarriedDepth, Correction, Pair, evenly, relative_error
-from extrags.frame_stacks import stacked
+from extrags.carried_depth import (
+    LEAST_POINTS,
+    MEDIAN,
+    CarriedDepth,
+    Correction,
+    Pair,
+    evenly,
+    relative_error,
+)
 from extrags.sequence import EndoscopicSequence
 
 __all__ = ["with_calibration_corrected"]
@@ -149,7 +156,7 @@ def _corrected_once(sequence: EndoscopicSequence, carried: CarriedDepth, lens: b
     along_ray = relative_error([carried.log_ratio(pair, along_ray=True) for pair in pairs])
     if along_ray < CLEARLY_LESS * error:
         _warn(sequence, error, along_ray, "depth is the distance along the ray", "it is converted to z-depth")
-        return _with_depth(sequence, lambda frame, depth: depth / _ray_lengths(sequence, frame))
+        return sequence.with_changed_depth(lambda frame, depth: depth / _ray_lengths(sequence, frame))
     best, left, family = Correction(), CLEARLY_LESS * error, None
     families = _families(float(np.median(carried.typical[carried.typical > 0])))
     # Points of the source were found with its poses and lens, and do not follow another.
@@ -165,17 +172,20 @@ def _corrected_once(sequence: EndoscopicSequence, carried: CarriedDepth, lens: b
         return sequence
     _warn(sequence, error, left, family.words, family.told(best))
     return replace(
-        _with_depth(sequence, lambda frame, depth: best.of_depth(depth)),
+        sequence.with_changed_depth(lambda _, depth: best.of_depth(depth)),
         K=best.of_intrinsics(sequence.K, sequence.width),
         world_from_camera=best.of_poses(sequence.cameras.world_from_camera),
     )
 
 
 def _fitted(carried: CarriedDepth, pairs: list[Pair], family: _Family) -> Correction | None:
-    """The correction of a family that makes the disagreement least; None where it leaves what is plausible.
+    """The correction of a family that leaves the least disagreement.
 
     Gauss-Newton with the weights of a Cauchy distribution; the derivatives by differences, so that they hold
     for any lens.
+
+    Returns:
+        None where the correction would be implausibly large, or too few points meet depth with it.
     """
     numbers = np.zeros(len(family.scale))
     scale = np.array(family.scale)
@@ -191,6 +201,8 @@ def _fitted(carried: CarriedDepth, pairs: list[Pair], family: _Family) -> Correc
             [(ratios(numbers + STEP * axis) - ratio) / STEP for axis in np.eye(len(numbers))], axis=1
         )
         known = np.isfinite(ratio) & np.isfinite(J).all(1)
+        if known.sum() < LEAST_POINTS:
+            return None
         spread = max(relative_error([ratio]) * np.sqrt(2), 1e-6)
         weight = 1 / (1 + (ratio[known] / (2 * spread)) ** 2)
         A = (weight[:, None] * J[known]).T @ J[known]
@@ -216,26 +228,6 @@ def _warn(sequence: EndoscopicSequence, error: float, left: float, found: str, d
         found,
         done,
         extra=_TOPIC,
-    )
-
-
-def _with_depth(
-    sequence: EndoscopicSequence, changed: Callable[[int, Float[np.ndarray, "h w"]], np.ndarray]
-) -> EndoscopicSequence:
-    """With all depth changed, frame by frame; unknown depth stays unknown."""
-
-    def of_all(depth_mm: np.ndarray | None) -> np.ndarray | None:
-        if depth_mm is None:
-            return None
-        frames = (
-            np.where(depth > 0, changed(k, depth), 0).astype(depth.dtype) for k, depth in enumerate(depth_mm)
-        )
-        return stacked(frames, len(depth_mm))
-
-    return replace(
-        sequence,
-        depth_mm=of_all(sequence.depth_mm),
-        withheld_depth_mm=of_all(sequence.withheld_depth_mm),
     )
 
 

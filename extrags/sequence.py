@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -260,6 +261,25 @@ class EndoscopicSequence(Storable):
             metric=True,
             scale_source=source,
         )
+
+    def with_changed_depth(
+        self, changed: Callable[[int, Float[np.ndarray, "h w"]], np.ndarray]
+    ) -> EndoscopicSequence:
+        """A copy with all depth changed frame by frame, that of the evaluation alike; 0, unknown, stays.
+
+        Args:
+            changed: takes the index of a frame and its depth [H, W], and returns the new depth.
+        """
+
+        def of_all(depth_mm: np.ndarray | None) -> np.ndarray | None:
+            if depth_mm is None:
+                return None
+            pairs = enumerate(depth_mm)
+            frames = (np.where(d > 0, changed(k, d), 0).astype(d.dtype) for k, d in pairs)
+            return stacked(frames, len(depth_mm))
+
+        depth_mm, withheld = of_all(self.depth_mm), of_all(self.withheld_depth_mm)
+        return replace(self, depth_mm=depth_mm, withheld_depth_mm=withheld)
 
     def without_training_depth(self) -> EndoscopicSequence:
         """A copy whose training frames have no depth, so that only the evaluation knows any.

@@ -45,7 +45,12 @@ MISPLACED_TIMES, MISPLACED_ERROR = 5.0, 0.02
 
 
 def shows_nothing(rgb: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]) -> bool:
-    """Whether a picture is black, or of one colour, inside its mask."""
+    """Whether a picture is black, or of one colour, inside its mask; so is one without any valid pixel.
+
+    Args:
+        rgb: from 0 to 255.
+        mask: true where a pixel shows tissue.
+    """
     every = max(1, round(np.sqrt(mask.size / LOOKED_AT_PX)))
     pixels = rgb[::every, ::every][mask[::every, ::every]]
     if not len(pixels):
@@ -58,7 +63,10 @@ def without_blank_frames(sequence: EndoscopicSequence) -> EndoscopicSequence:
     """The sequence, its split without frames that show nothing; a warning names them.
 
     A camera that is covered or switched off between two frames teaches the surface to be black. Held-out
-    frames of this kind measure nothing.
+    frames of this kind measure nothing. Where more than `MOST` of the training frames are so, all stay.
+
+    Args:
+        sequence: with or without poses.
     """
     blank = np.array(
         [shows_nothing(rgb, mask) for rgb, mask in zip(sequence.rgb, sequence.mask, strict=True)], dtype=bool
