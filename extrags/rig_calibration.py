@@ -173,7 +173,7 @@ def _corrected_once(sequence: EndoscopicSequence, carried: CarriedDepth, lens: b
     _warn(sequence, error, left, family.words, family.told(best))
     return replace(
         sequence.with_changed_depth(lambda _, depth: best.of_depth(depth)),
-        K=best.of_intrinsics(sequence.K, sequence.width),
+        K=best.of_intrinsics(sequence.K, float(sequence.width)),
         world_from_camera=best.of_poses(sequence.cameras.world_from_camera),
     )
 

@@ -90,6 +90,24 @@ def test_the_first_calls_are_checked_and_one_of_so_many_later_ones() -> None:
     assert sorted(checked + plain) == list(range(last))
 
 
+def test_the_first_call_with_arguments_of_other_types_is_checked() -> None:
+    checked: list[object] = []
+
+    def decorator(_: object) -> object:
+        return lambda *given, **named: checked.append((*given, *named.values()))
+
+    function = sampled(lambda *_, **__: None, decorator)
+    for number in range(FIRST_CALLS + 1):
+        function(number)
+    del checked[:]
+    for _ in range(2):
+        function(1.0)
+        function(1, 2)
+        function(1, more=2)
+        function(1, more=None)
+    assert checked == [(1.0,), (1, 2), (1, 2), (1, None)]
+
+
 def test_what_is_never_called_is_never_decorated() -> None:
     def decorator(_: object) -> object:
         raise AssertionError("decorated")
