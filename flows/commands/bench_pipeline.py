@@ -129,7 +129,9 @@ def pipeline(given: argparse.Namespace) -> int:
     if given.json != "-":
         from flows.terminal import console
 
-        console().print(table, markup=False, soft_wrap=True)
+        # The console shows a line feed inside a text as such.
+        for line in table.splitlines():
+            console().print(line, markup=False, soft_wrap=True)
         told = f"results: {folder / 'results.json'}" + (f", {folder / 'fronts.svg'}" if measured else "")
         console().print(told, soft_wrap=True, markup=False)
     write_json(found, given.json)

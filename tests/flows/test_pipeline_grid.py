@@ -301,6 +301,16 @@ def test_the_table_says_what_failed(tmp_path: Path) -> None:
     assert "failed" not in grid_markdown(fine)
 
 
+def test_the_table_is_printed_line_by_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    failed = {"metrics": None, "error": "ingest: no such file"}
+    monkeypatch.setattr("flows.pipeline_grid.in_own_process", lambda cell, _: {**_case(cell), **failed})
+    assert main(["bench", "pipeline", SEQUENCE, "--methods", "coarse", "--output", str(tmp_path)]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[:-1] == (tmp_path / "grid.md").read_text().splitlines()
+
+
 def posed_frame(folder: Path, *, grey: int) -> None:
     """A folder with one posed frame of one colour."""
     Image.fromarray(np.full((40, 48, 3), grey, np.uint8)).save(folder / "rgb" / "0.png")
