@@ -14,6 +14,7 @@ from flows.commands.benchmark import parsed_seeds
 from flows.commands.common import items, set_up_logging, write_json
 from flows.commands.options import Parser, add_json, add_methods, add_output, add_sequences, add_settings
 from flows.commands.outputs import output_folder
+from flows.commands.run_checks import check_names
 from flows.interruption import RESUMABLE, say_when_interrupted
 
 __all__ = ["EXAMPLES", "add_arguments", "pipeline"]
@@ -88,7 +89,12 @@ def add_arguments(parser: Parser) -> None:
 
 
 def pipeline(given: argparse.Namespace) -> int:
-    """`extrags bench pipeline`."""
+    """`extrags bench pipeline`; exit code 1 when a run failed.
+
+    Raises:
+        ConfigError: for wrong settings, methods or manifests.
+        UnknownSequenceError: for a name that is not in the catalogue, or a pattern that matches none.
+    """
     say_when_interrupted(RESUMABLE)
     set_up_logging(debug=given.debug, terminal=True, quiet=given.quiet)
     # Read when torch is loaded; the processes of the runs inherit it.
@@ -107,8 +113,10 @@ def pipeline(given: argparse.Namespace) -> int:
 
     vary = [parsed_vary(text) for text in given.vary]
     presets, settings = items(given.budgets), given.settings or {}
+    chosen = chosen_sequences(given.sequences)
+    check_names([item.name for item in chosen])
     cells = cells_of(
-        chosen_sequences(given.sequences),
+        chosen,
         items(given.methods),
         items(given.profiles),
         lambda config: budgets_of(config, presets, vary),

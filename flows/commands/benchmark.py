@@ -27,6 +27,7 @@ from flows.commands.options import (
     add_settings,
     add_store,
 )
+from flows.commands.run_checks import check_names
 from flows.interruption import RESUMABLE, say_when_interrupted
 
 if TYPE_CHECKING:
@@ -90,7 +91,12 @@ def add_arguments(parser: Parser) -> None:
 
 
 def benchmark(given: argparse.Namespace) -> int:
-    """`extrags benchmark`; exit code 1 when a run failed, or is worse than is tolerated."""
+    """`extrags benchmark`; exit code 1 when a run failed, or is worse than is tolerated.
+
+    Raises:
+        ConfigError: for wrong settings, methods or manifests.
+        UnknownSequenceError: for a name that is not in the catalogue, or a pattern that matches none.
+    """
     from extrags.config import profile_config
     from extrags.store import Store
     from flows.environment import has_own_home, prepare, without_heartbeat
@@ -124,8 +130,10 @@ def benchmark(given: argparse.Namespace) -> int:
     for profile in profiles:
         profile_config(profile)
     ways = len(profiles) * len(seeds) * (len(methods) + len(variants))
-    runs = len(chosen_sequences(given.sequences)) * ways
-    view = RunInView(runs, expected_seconds(profile_config(profiles[0])), "evaluate", root)
+    chosen = chosen_sequences(given.sequences)
+    # Each of its runs would fail, and with --refresh be on record in the history.
+    check_names([item.name for item in chosen])
+    view = RunInView(len(chosen) * ways, expected_seconds(profile_config(profiles[0])), "evaluate", root)
     if own_home:
         start_early()
     with temporary_server(), without_heartbeat(), progress_display(showing(given), view):

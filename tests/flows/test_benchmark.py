@@ -17,6 +17,7 @@ from extrags.errors import ArtefactGoneError, ConfigError
 from extrags.metrics.registry import PROTOCOL_VERSION
 from extrags.store import Store
 from flows.benchmark import Case, benchmark, case_of, check_methods, run_method, summary_of
+from flows.cli import main
 from flows.commands.benchmark import print_benchmark
 from flows.history import Tolerance, history_of
 from flows.limits import StageLimits
@@ -354,3 +355,22 @@ def test_names_are_told_with_their_brackets(capsys: pytest.CaptureFixture[str]) 
     said = capsys.readouterr().out
     for name in ("dim [b]", "[red]one", "scans [c]", "scans [d]/case"):
         assert name in said
+
+
+@pytest.mark.parametrize("command", [["benchmark"], ["bench", "pipeline", "--output", "grid"]])
+def test_an_unknown_sequence_is_refused_before_any_run(
+    command: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("EXTRAGS_STORE", str(tmp_path / "store"))
+    monkeypatch.setattr("flows.temporary_server.start_early", _never)
+    monkeypatch.setattr("flows.pipeline_grid.run_grid", _never)
+    assert main([*command, SEQUENCE, "phantomm/0@sparse"]) == 2
+    assert "no sequence 'phantomm/0@sparse'" in capsys.readouterr().err
+
+
+def _never(*_: object, **__: object) -> None:
+    raise AssertionError("nothing is to be run")
