@@ -32,6 +32,7 @@ from extrags.store.manifest import (
     same_content,
     stage_of,
 )
+from extrags.user_paths import expanded
 
 __all__ = ["UrlBackend", "default_cache_directory"]
 
@@ -40,7 +41,7 @@ def default_cache_directory() -> Path:
     """Where remote artefacts are kept for reading: `EXTRAGS_CACHE`, or the user's cache directory."""
     chosen = os.environ.get("EXTRAGS_CACHE")
     if chosen:
-        return Path(chosen)
+        return expanded(chosen)
     return cache_directory()
 
 

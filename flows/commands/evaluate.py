@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 import logging
 from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
 from extrags.errors import ConfigError
+from extrags.user_paths import expanded
 from flows.commands.common import (
     counted,
     finished_run,
@@ -110,9 +110,9 @@ def _renders(given: argparse.Namespace) -> dict[str, Any]:
             named_frames(without_pose, held_out),
         )
     views = read_renders(
-        Path(given.renders),
+        expanded(given.renders),
         sequence,
-        depth_folder=None if given.depth is None else Path(given.depth),
+        depth_folder=None if given.depth is None else expanded(given.depth),
         depth_step_mm=given.depth_step,
         not_measured=without_pose,
     )

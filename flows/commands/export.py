@@ -7,6 +7,7 @@ from pathlib import Path
 
 from extrags.errors import ConfigError, StoreError, reason_of
 from extrags.output_files import whole_folder
+from extrags.user_paths import expanded
 from flows.commands.common import counted, set_up_logging
 from flows.commands.export_scene import ALONG
 from flows.commands.options import Parser, add_method, add_output, add_sequence
@@ -205,7 +206,7 @@ def _check(given: argparse.Namespace) -> None:
             raise ConfigError(f"--panels: no panel {panel!r}; known: {', '.join(PANELS)}")
         if panels.count(panel) > 1:
             raise ConfigError(f"--panels: {panel} is named twice")
-    if given.along not in (None, *ALONG) and not Path(given.along).is_file():
+    if given.along not in (None, *ALONG) and not expanded(given.along).is_file():
         wanted = f"expected {', '.join(ALONG)} or a FILE.json"
         raise ConfigError(f"--along {given.along}: there is no such file; {wanted}")
     suffixes = SUFFIXES.get(given.to)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from extrags.errors import ConfigError, ExtragsError, StoreError, reason_of
+from extrags.user_paths import expanded
 from flows.commands.common import finished_run, is_terminal, run_config, set_up_logging, showing
 from flows.commands.outputs import made_folder
 
@@ -236,7 +237,7 @@ def _flight(given: argparse.Namespace) -> CameraPath:
     else:
         if given.between is not None:
             raise ConfigError("--between adds nothing to a camera path from a file: it is taken as it is")
-        read = read_camera_path(Path(along))
+        read = read_camera_path(expanded(along))
         path = CameraPath(read.cameras, given.fps or read.fps)
     if given.width is None:
         return path

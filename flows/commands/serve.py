@@ -7,10 +7,10 @@ import os
 import warnings
 from collections.abc import Sequence
 from contextlib import suppress
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from extrags.errors import ConfigError
+from extrags.user_paths import expanded
 from flows.commands.common import set_up_logging, store_root
 from flows.commands.options import Parser, add_store
 from flows.interruption import say_when_interrupted
@@ -64,7 +64,7 @@ def serve(given: argparse.Namespace) -> int:
 
     if given.limit < 1:
         raise ConfigError(f"--limit is {given.limit}; expected 1 or more")
-    declared = declared_deployments(Path(given.file) if given.file else usual_file())
+    declared = declared_deployments(expanded(given.file) if given.file else usual_file())
     set_up_logging(debug=given.debug, terminal=False)
     # Runs are processes with another working directory: what they find by is absolute.
     if given.store or os.environ.get("EXTRAGS_STORE"):

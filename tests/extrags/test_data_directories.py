@@ -37,6 +37,11 @@ def test_the_users_directories(home: Path) -> None:
     assert cache_directory() == default_cache_directory() == home / ".cache/extrags"
 
 
+def test_copies_below_a_home_folder(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("EXTRAGS_CACHE", "~/copies")
+    assert default_cache_directory() == home / "copies"
+
+
 def test_xdg_variables_are_honoured(home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))

@@ -132,10 +132,18 @@ class TestEvaluate:
         folders: Path,
         tmp_path: Path,
         capsys: pytest.CaptureFixture[str],
+        monkeypatch: pytest.MonkeyPatch,
     ) -> None:
         store, _ = finished
+        monkeypatch.setenv("HOME", str(tmp_path))
         for arguments, code, message in (
             (["--renders", str(tmp_path / "none")], 1, "no such folder"),
+            (["--renders", "~/none"], 1, f"{tmp_path}/none: there is no such folder of images"),
+            (
+                ["--renders", str(folders / "renders"), "--depth", "~/none"],
+                1,
+                f"{tmp_path}/none: there is no such folder of depth maps",
+            ),
             (["--depth", str(folders / "depth")], 2, "--depth goes with --renders"),
             (["--renders", str(folders / "renders"), "--depth-step", "0.1"], 2, "--depth-step goes with"),
             (["--depth-step", "0.1"], 2, "--depth-step goes with --depth"),

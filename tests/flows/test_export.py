@@ -16,7 +16,8 @@ import torch
 import trimesh
 from plyfile import PlyData
 
-from extrags.export import read_camera_path
+from extrags.cameras import Cameras
+from extrags.export import CameraPath, read_camera_path, write_camera_path
 from extrags.radial_lens import RadialLens
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
@@ -207,6 +208,15 @@ class TestFlights:
         assert export(finished, "--to", "video", "--panels", "uncertainty", "-o", str(target)) == 0
         with av.open(str(target)) as container:
             assert container.streams.video[0].width == 48
+
+
+def test_a_camera_path_in_the_home_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    K = np.array([[[40.0, 0, 24], [0, 40.0, 20], [0, 0, 1]]])
+    write_camera_path(CameraPath(Cameras(K, np.eye(4)[None], 48, 40)), tmp_path / "path.json")
+    target = tmp_path / "copy.json"
+    assert main(["export", SEQUENCE, "--along", "~/path.json", "--to", "camera-path", "-o", str(target)]) == 0
+    assert len(read_camera_path(target).cameras) == 1
 
 
 class TestCameras:
