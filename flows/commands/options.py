@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "DEFAULT_METHOD",
+    "MISSING",
     "Parser",
     "add_json",
     "add_method",
@@ -39,11 +40,14 @@ __all__ = [
     "add_verb",
     "number_above_zero",
     "whole_number",
+    "words_taken_by",
 ]
 
 DEFAULT_PROFILE = "balanced"
 """That of `extrags.config`, which takes long to load."""
 DEFAULT_METHOD = "extrags"
+MISSING = "the following arguments are required: "
+"""How argparse begins to say so."""
 
 SHORT_NAMES = {"--scale": "ingest.scale_mm_per_unit"}
 """Settings with a flag of their own beside that of their name."""
@@ -56,6 +60,8 @@ class Parser(argparse.ArgumentParser):
         super().__init__(allow_abbrev=False, **more)
         self.listing = ""
         """What `--help` ends with."""
+        self._words: list[str] = []
+        """Of the command line, those that this parser was given."""
         # On every parser: it may stand behind any verb. SUPPRESS, lest the inner one reset the outer one.
         self.add_argument(
             "--debug", action="store_true", default=argparse.SUPPRESS, help="show tracebacks and the log"
@@ -74,6 +80,7 @@ class Parser(argparse.ArgumentParser):
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Refuse here what is not known: the parser of the verb knows what is near."""
+        self._words = [str(word) for word in args or ()]
         given, unknown = super().parse_known_args(args, namespace)
         if unknown:
             name = unknown[0].partition("=")[0]
@@ -86,7 +93,21 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Raise instead of leaving: `flows.cli.main` says it."""
+        lists = {
+            option
+            for action in self._actions
+            if action.nargs in ("+", "*")
+            for option in action.option_strings
+        }
+        last = next((word for word in reversed(self._words) if word in lists), None)
+        if message.startswith(MISSING) and last is not None:
+            message += words_taken_by(last)
         raise ConfigError(f"{message} (see {self.prog} --help)")
+
+
+def words_taken_by(option: str) -> str:
+    """What to say of an option with several values where a word that is needed is missing."""
+    return f"; {option} takes all words behind it: other words stand before it, or behind --"
 
 
 def add_verb(

@@ -28,6 +28,7 @@ from flows.commands.common import (
     write_json,
 )
 from flows.commands.options import (
+    MISSING,
     Parser,
     add_json,
     add_method,
@@ -35,6 +36,7 @@ from flows.commands.options import (
     add_sequences,
     add_stages,
     number_above_zero,
+    words_taken_by,
 )
 from flows.commands.run_checks import check_names, check_working_distance, wrong_source
 from flows.failures import describe_error
@@ -115,9 +117,9 @@ def run(given: argparse.Namespace) -> int:
         raise ConfigError(f"--at-once is {given.at_once}; expected 1 or more")
     sequences = [*given.sequences, *(f"@{file}" for file in given.manifest)]
     if not sequences:
-        raise ConfigError(
-            "the following arguments are required: SEQUENCE or --manifest FILE (see extrags run --help)"
-        )
+        several = next((f"--{name}" for name in ("methods", "seeds") if getattr(given, name)), None)
+        taken = "" if several is None else words_taken_by(several)
+        raise ConfigError(f"{MISSING}SEQUENCE or --manifest FILE{taken} (see extrags run --help)")
     if given.seeds and given.seed is not None:
         raise ConfigError("--seeds replaces --seed: give one of the two")
     if given.methods and getattr(given, "said_method", False):

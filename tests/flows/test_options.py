@@ -99,3 +99,25 @@ def test_the_output_has_one_spelling_that_is_shown_and_another_that_is_understoo
 
 def test_the_default_profile_is_that_of_the_library() -> None:
     assert options.DEFAULT_PROFILE == DEFAULT_PROFILE
+
+
+@pytest.mark.parametrize(
+    ("arguments", "option"),
+    [
+        (["run", "--seeds", "0,1", "phantom/0"], "--seeds"),
+        (["run", "--methods", "3dgs", "phantom/0", "--quiet"], "--methods"),
+        (["benchmark", "--methods", "coarse", "3dgs", "phantom/0"], "--methods"),
+    ],
+)
+def test_an_option_that_has_taken_the_sequences_is_named(
+    arguments: list[str], option: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(arguments) == 2
+    said = capsys.readouterr().err
+    assert "arguments are required: SEQUENCE" in said
+    assert f"; {option} takes all words behind it: other words stand before it, or behind --" in said
+
+
+def test_nothing_is_said_of_options_that_have_taken_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["benchmark", "--name", "weekly"]) == 2
+    assert "takes all words" not in capsys.readouterr().err
