@@ -52,7 +52,7 @@ def render(
     frames = np.asarray(sequence.test if frames is None else frames)
     gains = None
     if scene.light is not None:
-        trained = sequence.train if train_on == "train" else np.arange(len(sequence))
+        trained = sequence.train if train_on == "train" else sequence.split.frames
         gains = scene.light.interpolated_exposures(frames, trained, sequence.recording)
     # Held-out views may be hundreds, of full size.
     rgb, alpha, depth = (FrameStack(len(frames)) for _ in range(3))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -11,7 +13,9 @@ from extrags.frame_stacks import empty_stack
 from extrags.sequence import EndoscopicSequence
 from extrags.splits import Split
 
-__all__ = ["never_observed", "observed_by_depth", "observed_from_depth"]
+__all__ = ["never_observed", "observed_by_depth", "observed_by_those_left", "observed_from_depth"]
+
+_LOG = logging.getLogger(__name__)
 
 _ROUNDING = 1e-6
 """Share by which a depth may differ between two ways to compute it."""
@@ -105,6 +109,37 @@ def observed_from_depth(
         observed[index][known] = seen
         emit(Progress(stage, done, len(test)))
     return observed
+
+
+def observed_by_those_left(
+    sequence: EndoscopicSequence, left: Int[np.ndarray, "n"], *, stage: str = "ingest"
+) -> Bool[np.ndarray, "f h w"] | None:
+    """What is observed in held-out frames once some training frames have left.
+
+    By true depth and the source's own poses; what no training frame saw before stays unobserved. Where these
+    are not known nothing tells what the others saw, and nothing is said.
+
+    Args:
+        sequence: as it came.
+        left: training frames that stay.
+        stage: whose progress it is.
+
+    Returns:
+        True where observed, [F, H, W]; None where nothing tells.
+    """
+    if sequence.observed is None or len(left) == len(sequence.train):
+        return sequence.observed
+    depth = sequence.true_depth_mm
+    if depth is None or sequence.world_from_camera is None or sequence.intrinsics == "guessed":
+        _LOG.warning(
+            "%s: %d training frames are dropped, and without true depth and poses nothing tells what the "
+            "others observed: observed and unobserved pixels are not told apart",
+            sequence.name,
+            len(sequence.train) - len(left),
+        )
+        return None
+    seen = observed_from_depth(sequence.cameras, sequence.mask, depth, left, sequence.test, stage=stage)
+    return np.asarray(seen & sequence.observed)
 
 
 def observed_by_depth(

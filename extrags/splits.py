@@ -38,6 +38,11 @@ class Split:
                 object.__setattr__(self, part, indices)
             check_array(indices, f"split {self.name}: {part}", (None,), np.integer)
 
+    @property
+    def frames(self) -> Int[np.ndarray, "n"]:
+        """All frames of either part, in order; those that show nothing, say, are in neither."""
+        return np.union1d(self.train, self.test)
+
 
 def every_nth(frames: int, holdout_every: int) -> Split:
     """Hold out frames 0, n, 2n, ... in the order of the recording; of one frame, which trains, none.

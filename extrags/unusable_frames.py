@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from extrags.carried_depth import CarriedDepth, Pair
+from extrags.frame_stacks import frames_of
+from extrags.observed_surface import observed_by_those_left
 from extrags.sequence import EndoscopicSequence
 from extrags.splits import Split
 
-__all__ = ["shows_nothing", "without_blank_frames", "without_misplaced_frames"]
+__all__ = ["of_split", "shows_nothing", "without_blank_frames", "without_misplaced_frames"]
 
 _log = logging.getLogger(__name__)
 
@@ -115,7 +118,7 @@ def _difference(ratio: Float[np.ndarray, "p"]) -> float:
 def _without(
     sequence: EndoscopicSequence, frames: Int[np.ndarray, "n"], what: str, field: str
 ) -> EndoscopicSequence:
-    """With a split that does not name these frames."""
+    """With a split that does not name these frames; what they saw does not count as observed."""
     split = sequence.split
     train, test = (np.setdiff1d(part, frames) for part in (split.train, split.test))
     lost = len(split.train) - len(train)
@@ -133,4 +136,38 @@ def _without(
         what,
         extra={"topic": "unusable frames", "field": field},
     )
-    return replace(sequence, split=Split(split.name, train, test, split.version))
+    return replace(
+        sequence,
+        split=Split(split.name, train, test, split.version),
+        observed=observed_by_those_left(sequence, train),
+    )
+
+
+def of_split(sequence: EndoscopicSequence) -> EndoscopicSequence:
+    """The sequence without the frames that are neither trained on nor held out, for who knows no split.
+
+    Frames keep their names; the split is renumbered. Where there are no such frames, the sequence is returned
+    as it is.
+
+    Args:
+        sequence: with or without poses.
+    """
+    kept = sequence.split.frames
+    if len(kept) == len(sequence):
+        return sequence
+
+    def of_kept(stack: Any) -> Any:
+        return None if stack is None else frames_of(stack, kept)
+
+    split = sequence.split
+    train, test = (np.searchsorted(kept, part) for part in (split.train, split.test))
+    stacks = ("depth_mm", "withheld_depth_mm", "depth_error", "observed", "specular")
+    return replace(
+        sequence,
+        rgb=of_kept(sequence.rgb),
+        K=sequence.K[kept],
+        mask=of_kept(sequence.mask),
+        split=Split(split.name, train, test, split.version),
+        frame_names=tuple(sequence.frame_name(int(frame)) for frame in kept),
+        **{name: of_kept(getattr(sequence, name)) for name in (*stacks, "world_from_camera", "recording")},
+    )

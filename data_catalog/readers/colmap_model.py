@@ -62,6 +62,7 @@ from extrags.frame_names import (
 )
 from extrags.lens import Lens
 from extrags.sequence import EndoscopicSequence
+from extrags.unusable_frames import of_split
 
 __all__ = ["READER", "model_folder", "points_of", "read_depth_map", "write_colmap", "write_depth_map"]
 
@@ -291,7 +292,8 @@ def write_colmap(
     """Write a posed sequence as the workspace described above.
 
     Cameras become PINHOLE, one for each K. Numbers keep all their digits, so that a model that is read back
-    differs by rounding only. Depth goes to `stereo/depth_maps`.
+    differs by rounding only. Depth goes to `stereo/depth_maps`. Frames of neither part of the split, which
+    other programs would train on, are not written.
 
     Args:
         sequence: with poses.
@@ -304,6 +306,7 @@ def write_colmap(
         ShapeError: while the sequence has no poses.
         SourceError: a frame's name has a line break, or leads out of the folder.
     """
+    sequence = of_split(sequence)
     cameras = sequence.cameras
     for index in range(len(sequence)):
         if any(letter in sequence.frame_name(index) for letter in "\r\n"):

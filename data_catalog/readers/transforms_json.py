@@ -72,6 +72,7 @@ from extrags.config import IngestConfig
 from extrags.errors import PoseError, SourceError, SourceNotFoundError
 from extrags.frame_names import NameOrder, natural_key, order_for_fingerprint, tell_about_order
 from extrags.sequence import EndoscopicSequence
+from extrags.unusable_frames import of_split
 
 __all__ = ["READER", "TRANSFORMS_FILE", "write_transforms"]
 
@@ -211,7 +212,7 @@ def write_transforms(
 
     Numbers keep all their digits. Depth is written as float `.npy` in thousandths of the pose unit, which is
     what nerfstudio expects; `length_unit` says what that unit is. Held-out frames are those of `test` and of
-    `val`; where there are none, no list is written.
+    `val`; where there are none, no list is written. Frames of neither part of the split are not written.
 
     Args:
         sequence: with poses.
@@ -222,6 +223,7 @@ def write_transforms(
     Raises:
         ShapeError: while the sequence has no poses.
     """
+    sequence = of_split(sequence)
     cameras = sequence.cameras
     if points is None:
         points, points_rgb = sequence.points, sequence.points_rgb

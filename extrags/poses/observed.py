@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import logging
-
 import numpy as np
 from jaxtyping import Bool
 
-from extrags.observed_surface import observed_from_depth
+from extrags.observed_surface import observed_by_those_left as of_those_left
 from extrags.sequence import EndoscopicSequence
 
 __all__ = ["observed_by_those_left"]
-
-_LOG = logging.getLogger(__name__)
 
 
 def observed_by_those_left(
@@ -31,16 +27,4 @@ def observed_by_those_left(
         True where observed, [F, H, W]; None where nothing tells.
     """
     left = sequence.train[registered[sequence.train]]
-    if sequence.observed is None or len(left) == len(sequence.train):
-        return sequence.observed
-    depth = sequence.true_depth_mm
-    if depth is None or sequence.world_from_camera is None or sequence.intrinsics == "guessed":
-        _LOG.warning(
-            "%s: %d training frames are dropped, and without true depth and poses nothing tells what the "
-            "others observed: observed and unobserved pixels are not told apart",
-            sequence.name,
-            len(sequence.train) - len(left),
-        )
-        return None
-    seen = observed_from_depth(sequence.cameras, sequence.mask, depth, left, sequence.test, stage="poses")
-    return np.asarray(seen & sequence.observed)
+    return of_those_left(sequence, left, stage="poses")

@@ -53,7 +53,7 @@ def reconstruct(
         sequence: posed frames.
         config: budgets, rates and weights; None takes those of the profile `balanced`.
         frames: which frames to use; default: those of `config.train_on`, the split's training frames or,
-            for the oracle, all.
+            for the oracle, all of the split.
         stage: named in progress events.
         device: where it is optimised, and where the scene will be.
         earlier: a scene of some of the frames to go on from, for the iterations it names; None starts anew.
@@ -82,7 +82,7 @@ def reconstruct(
     if not sequence.training_depth_known:
         # The oracle is given held-out frames too, whose depth is for the evaluation alone.
         sequence = replace(sequence, depth_mm=None)
-    default = sequence.train if config.train_on == "train" else np.arange(len(sequence))
+    default = sequence.train if config.train_on == "train" else sequence.split.frames
     chosen = default if frames is None else np.asarray(frames)
     if len(chosen) == 0:
         raise CaptureError(f"{sequence.name}: no training frames")

@@ -238,5 +238,5 @@ def _sequence(given: argparse.Namespace) -> int:
     except OSError as error:
         raise StoreError(f"{target} cannot be written: {reason_of(error)}") from error
     count = 0 if points is None else len(points)
-    print(f"{target}: {counted(len(sequence), 'frame')} with poses, {counted(count, 'point')}")
+    print(f"{target}: {counted(len(sequence.split.frames), 'frame')} with poses, {counted(count, 'point')}")
     return 0

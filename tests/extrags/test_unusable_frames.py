@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import extrags
+from data_catalog.readers.colmap_model import write_colmap
+from data_catalog.readers.transforms_json import write_transforms
 from extrags.carried_depth import CarriedDepth
-from extrags.sequence import EndoscopicSequence
-from extrags.unusable_frames import shows_nothing, without_blank_frames
+from extrags.config import CoarseConfig, IngestConfig
+from extrags.evaluation import render
+from extrags.observed_surface import observed_by_depth
+from extrags.sequence import EndoscopicSequence, Split
+from extrags.training import reconstruct
+from extrags.unusable_frames import of_split, shows_nothing, without_blank_frames
 from extrags.unusable_frames import without_misplaced_frames as without_misplaced
 from tests.extrags.depth.withheld import recorded
 from tests.extrags.test_measured_depth import displaced
@@ -83,6 +91,42 @@ def test_blank_frames_leave_the_split(exact: EndoscopicSequence, caplog: pytest.
 def test_where_many_are_blank_it_is_the_scene(exact: EndoscopicSequence) -> None:
     given = blank(exact, [0, 2, 4, 6])
     assert without_blank_frames(given) is given
+
+
+def test_what_blank_frames_saw_does_not_count_as_observed(exact: EndoscopicSequence) -> None:
+    given = blank(exact, [9])
+    seen = observed_by_depth(given.cameras, given.mask, given.depth_mm, given.split)
+    found = without_blank_frames(replace(given, observed=seen)).observed
+    left = Split("left", np.arange(9), given.test)
+    assert found is not None
+    assert seen is not None
+    assert np.array_equal(found, observed_by_depth(given.cameras, given.mask, given.depth_mm, left))
+    assert found.sum() < seen.sum()
+
+
+def test_the_oracle_is_trained_on_no_blank_frame(exact: EndoscopicSequence) -> None:
+    given = without_blank_frames(blank(exact, [2]))
+    config = CoarseConfig(train_on="all", iterations=1, max_points=500, inconsistent_frames="ignore")
+    scene = reconstruct(given, config).scene
+    assert scene.light is not None
+    assert len(scene.light.log_exposure) == 10
+    assert len(render(scene, given, train_on="all")) == 1
+
+
+@pytest.mark.parametrize("write", [write_colmap, write_transforms])
+def test_blank_frames_are_not_handed_to_other_programs(
+    exact: EndoscopicSequence, write: Callable[[EndoscopicSequence, Path], None], tmp_path: Path
+) -> None:
+    write(without_blank_frames(blank(exact, [2])), tmp_path)
+    assert not list(tmp_path.rglob("*0002.*"))
+    read = extrags.read(tmp_path, IngestConfig())
+    assert [read.frame_name(k) for k in range(len(read))] == [f"{k:04d}" for k in range(11) if k != 2]
+    assert read.test.tolist() == [9]
+    assert np.array_equal(read.rgb, np.delete(exact.rgb, 2, axis=0))
+
+
+def test_a_sequence_without_frames_that_left_is_the_same(exact: EndoscopicSequence) -> None:
+    assert of_split(exact) is exact
 
 
 @pytest.mark.parametrize("which", [0, 4])
