@@ -182,7 +182,7 @@ def check(given: argparse.Namespace) -> int:
             _print_inspection(out, found)
     write_json([{"ok": found.ok, **found.model_dump(mode="json")} for found in inspections], given.json)
     if unknown:
-        raise UnknownSequenceError("\n".join(unknown))
+        raise UnknownSequenceError("; ".join(unknown))
     return 0 if all(found.ok for found in inspections) else 1
 
 

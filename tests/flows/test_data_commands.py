@@ -191,7 +191,7 @@ class TestCheck:
         assert "is larger than the source's 40 x 32" in finding["sentence"]
         assert right["facts"]["width"] == 48
         assert "phantm/1@sparse" in said.err
-        assert "nothing/here" in said.err
+        assert "; no sequence 'nothing/here'" in said.err
 
     def test_unknown_name_is_wrong_usage(self, capsys: pytest.CaptureFixture[str]) -> None:
         assert main(["data", "check", "phantm/1@sparse"]) == 2
