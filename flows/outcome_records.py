@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import math
+import re
 import time
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
@@ -33,7 +34,7 @@ __all__ = [
 
 OUTCOME = "outcome."
 """Begin of the names of these records."""
-REPORT = "report-v"
+REPORT = re.compile(r"report-v\d+-")
 """Begin of the keys of a sequence's own pages."""
 
 OutcomeRecord = dict[str, Any]
@@ -183,7 +184,7 @@ def record_of(records: Mapping[str, OutcomeRecord], name: str, former_name: str)
 def report_key(name: str) -> str | None:
     """The key of a page that is named by its file, its folder or itself; None for a sequence."""
     parts = [part for part in name.replace("\\", "/").split("/") if part]
-    return next((part for part in reversed(parts[-2:]) if part.startswith(REPORT)), None)
+    return next((part for part in reversed(parts[-2:]) if REPORT.match(part)), None)
 
 
 def recorded_page(store: Store, record: OutcomeRecord, there: Collection[str]) -> str | None:

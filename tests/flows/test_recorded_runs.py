@@ -105,6 +105,11 @@ def test_a_page_that_is_gone(store: Store) -> None:
         chosen_runs(store, ["report-v1-0123456789abcdef0123456789abcdef"])
 
 
+def test_a_folder_of_frames_may_be_called_like_a_page(store: Store) -> None:
+    with pytest.raises(ConfigError, match="0 finished runs on record"):
+        chosen_runs(store, ["report-video"])
+
+
 class Traits(RecordedRun):
     """A run of which nothing is known but its traits."""
 
