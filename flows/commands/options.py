@@ -91,6 +91,14 @@ class Parser(argparse.ArgumentParser):
             self.error(f"unknown argument {name}{did_you_mean(name, options)}")
         return given, unknown
 
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        """Behind all verbs, or values of an option, that there are: the one that was perhaps meant."""
+        try:
+            super()._check_value(action, value)
+        except argparse.ArgumentError as error:
+            error.message += did_you_mean(str(value), [str(choice) for choice in action.choices or ()])
+            raise
+
     def error(self, message: str) -> NoReturn:
         """Raise instead of leaving: `flows.cli.main` says it."""
         lists = {

@@ -140,6 +140,11 @@ class TestStart:
         said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
         assert said.stdout.rstrip().endswith("[]")
 
+    @pytest.mark.parametrize(("words", "meant"), [(["runn", "phantom/0"], "run"), (["cache", "lss"], "ls")])
+    def test_a_misspelt_verb(self, words: list[str], meant: str, capsys: pytest.CaptureFixture[str]) -> None:
+        assert main(words) == 2
+        assert f"; did you mean {meant}? (see extrags" in capsys.readouterr().err
+
     def test_no_verb_shows_help(self, capsys: pytest.CaptureFixture[str]) -> None:
         assert main([]) == 2
         assert "verbs" in capsys.readouterr().out
@@ -174,6 +179,7 @@ class TestUsage:
             ([SEQUENCE, "--seeds", f"0,{2**64}"], f"--seeds {2**64}: expected 0 to"),
             ([SEQUENCE, "--coarse.seed", str(2**64)], "coarse.seed"),
             ([SEQUENCE, "--until", "finnish"], "invalid choice: 'finnish' (choose from 'ingest', 'poses'"),
+            ([SEQUENCE, "--profile", "balancd"], "; did you mean balanced?"),
             (
                 [],
                 "the following arguments are required: SEQUENCE or --manifest FILE (see extrags run --help)",
