@@ -6,9 +6,10 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+from extrags.config import DEFAULT_PROFILE
 from extrags.errors import ConfigError, installed_with
 from extrags.user_paths import expanded
-from flows.commands.common import finished_run, run_config, set_up_logging
+from flows.commands.common import DEFAULT_METHOD, finished_run, run_config, set_up_logging
 from flows.commands.options import Parser, add_method
 from flows.interruption import until_told_to_stop
 from flows.printable import in_one_line
@@ -126,8 +127,9 @@ def _check(given: argparse.Namespace) -> None:
     if not 0 <= given.port <= 65535:
         raise ConfigError(f"--port is {given.port}; expected 0 to 65535")
     if _is_file(given):
-        for name in ("scene", "seed", "settings"):
-            if getattr(given, name) not in (None, {}):
+        usual = {"method": DEFAULT_METHOD, "profile": DEFAULT_PROFILE}
+        for name in ("scene", "seed", "method", "profile", "store", "settings"):
+            if getattr(given, name) not in (None, {}, usual.get(name)):
                 flag = f"--{name}" if name != "settings" else ", ".join(f"--{key}" for key in given.settings)
                 raise ConfigError(f"{flag} does not apply to a file of Gaussians; it is for a SEQUENCE")
 
