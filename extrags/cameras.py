@@ -331,24 +331,25 @@ def look_at(
 
 
 def transform_points(
-    motion: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "*p 3"]
+    motion: Float[np.ndarray, "*m 4 4"], points: Float[np.ndarray, "*p 3"]
 ) -> Float[np.ndarray, "*p 3"]:
-    """Apply a rigid motion [4, 4] to points.
+    """Apply a rigid motion to points: one to all, or to each its own.
 
     Computed without BLAS, whose rounding depends on the number of threads and of points.
     """
     x, y, z = np.moveaxis(points, -1, 0)
-    return np.stack([a * x + b * y + c * z + shift for a, b, c, shift in motion[:3]], axis=-1)
+    rows = np.moveaxis(motion[..., :3, :], (-2, -1), (0, 1))
+    return np.stack([a * x + b * y + c * z + shift for a, b, c, shift in rows], axis=-1)
 
 
 def project_points(
-    points: Float[np.ndarray, "*p 3"], K: Float[np.ndarray, "3 3"], lens: RadialLens | None = None
+    points: Float[np.ndarray, "*p 3"], K: Float[np.ndarray, "*k 3 3"], lens: RadialLens | None = None
 ) -> Float[np.ndarray, "*p 2"]:
     """Pixels (u, v) of points in a camera's own frame; NaN where z is not positive or the lens sees nothing.
 
     Args:
         points: x right, y down, z forward.
-        K: intrinsics in pixels.
+        K: intrinsics in pixels, of all or of each.
         lens: None for a pinhole; else points outside its field of view have no pixel.
     """
     z = np.where(points[..., 2] > 0, points[..., 2], np.nan)
@@ -358,29 +359,29 @@ def project_points(
         x, y = lens.distorted(x, y)
         return np.stack(
             [
-                np.where(seen, K[0, 0] * x + K[0, 2], np.nan),
-                np.where(seen, K[1, 1] * y + K[1, 2], np.nan),
+                np.where(seen, K[..., 0, 0] * x + K[..., 0, 2], np.nan),
+                np.where(seen, K[..., 1, 1] * y + K[..., 1, 2], np.nan),
             ],
             axis=-1,
         )
-    u = K[0, 0] * points[..., 0] / z + K[0, 2]
-    v = K[1, 1] * points[..., 1] / z + K[1, 2]
+    u = K[..., 0, 0] * points[..., 0] / z + K[..., 0, 2]
+    v = K[..., 1, 1] * points[..., 1] / z + K[..., 1, 2]
     return np.stack([u, v], axis=-1)
 
 
 def unproject_pixels(
-    pixels: Float[np.ndarray, "*p 2"], K: Float[np.ndarray, "3 3"], lens: RadialLens | None = None
+    pixels: Float[np.ndarray, "*p 2"], K: Float[np.ndarray, "*k 3 3"], lens: RadialLens | None = None
 ) -> Float[np.ndarray, "*p 3"]:
     """Rays through pixels (u, v) in a camera's own frame, with unit z: the inverse of `project_points`.
 
     Args:
         pixels: centres at +0.5.
-        K: intrinsics in pixels.
+        K: intrinsics in pixels, of all or of each.
         lens: None for a pinhole. Pixels beyond a lens's field of view get rays at most 88 degrees from its
             axis; `field_mask` tells them apart.
     """
-    x = (pixels[..., 0] - K[0, 2]) / K[0, 0]
-    y = (pixels[..., 1] - K[1, 2]) / K[1, 1]
+    x = (pixels[..., 0] - K[..., 0, 2]) / K[..., 0, 0]
+    y = (pixels[..., 1] - K[..., 1, 2]) / K[..., 1, 1]
     if lens is not None:
         x, y = lens.undistorted(np.asarray(x), np.asarray(y))
     return np.stack([x, y, np.ones_like(x)], axis=-1)

@@ -7,12 +7,16 @@ tells of errors that frames have in common (`extrags.rig_calibration`) and of ea
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
 
 from extrags.cameras import Cameras, project_points, transform_points, unproject_pixels
+from extrags.errors import SourceError
+from extrags.lens import Lens
+from extrags.radial_lens import RadialLens
 from extrags.sequence import EndoscopicSequence
 from extrags.source_frames import select_sources
 
@@ -32,6 +36,9 @@ POINTS = 1500
 
 LEAST_POINTS = 100
 """Points that meet depth in the other frame, below which a pair tells nothing."""
+
+CARRIED_TOGETHER = 6
+"""Pairs: arrays of all at once would be given back to the system and asked for anew at each operation."""
 
 LEAST_PAIRS = 12
 """Pairs below which a few that see the two sides of a fold decide; five frames have as many, mostly."""
@@ -61,6 +68,8 @@ class Correction:
         offset: added to depth after that, in the sequence's unit.
         log_focal: logarithms of factors on both focal lengths.
         shift: of the principal point, as a share of the image's width.
+        distortion: radial distortion of a lens that was said to be a pinhole, k of COLMAP's `DIVISION`: a
+            pixel at r focal lengths from the principal point sees what a pinhole has at r / (1 + k r^2).
         turn: of each camera about its own axes, a rotation vector in radians.
         move: of each camera along its own axes, in the sequence's unit.
     """
@@ -69,6 +78,7 @@ class Correction:
     offset: float = 0.0
     log_focal: tuple[float, float] = (0.0, 0.0)
     shift: tuple[float, float] = (0.0, 0.0)
+    distortion: float = 0.0
     turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
     move: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
@@ -84,6 +94,26 @@ class Correction:
         found[..., 1, 1] *= np.exp(self.log_focal[1])
         found[..., :2, 2] += np.array(self.shift) * width
         return found
+
+    def of_lens(
+        self, K: Float[np.ndarray, "b 3 3"], lens: RadialLens | None, width: int, height: int
+    ) -> tuple[Float[np.ndarray, "b 3 3"], RadialLens | None]:
+        """Corrected intrinsics and lens of images of this size.
+
+        Raises:
+            SourceError: where the distortion folds back inside the image.
+        """
+        K = self.of_intrinsics(K, float(width))
+        if self.distortion == 0:
+            return K, lens
+        corners = np.array([[x - K[0, 0, 2], y - K[0, 1, 2]] for x in (0, width) for y in (0, height)])
+        if self.distortion * np.square(corners / K[0, [0, 1], [0, 1]]).sum(1).max() >= 1:
+            raise SourceError("the distortion folds back inside the image", field="lens")
+        linear = (float(K[0, 0, 0]), float(K[0, 1, 1]), float(K[0, 0, 2]), float(K[0, 1, 2]))
+        fit = Lens("DIVISION", (*linear, self.distortion), width, height).radial()
+        # All frames have one lens; only its linear part may be of the frame.
+        K[:, [0, 1], [0, 1]] *= fit.K[0, 0] / K[0, 0, 0]
+        return K, fit.lens
 
     def of_poses(self, world_from_camera: Float[np.ndarray, "*b 4 4"]) -> Float[np.ndarray, "*b 4 4"]:
         """Corrected poses."""
@@ -151,7 +181,7 @@ class CarriedDepth:
         return carried if len(carried.pairs) >= LEAST_PAIRS else None
 
     def ratio(self, pair: Pair) -> Float[np.ndarray, "p"]:
-        """`log_ratio` of one of the pairs, with everything as it is given."""
+        """That of `log_ratios` for one of the pairs, with everything as it is given."""
         return self._ratios[pair]
 
     def known(self, position: int) -> Float[np.ndarray, "h w"]:
@@ -166,52 +196,79 @@ class CarriedDepth:
         kept = slice(self._stride // 2, None, self._stride)
         return kept, kept
 
-    def motion(self, pair: Pair, correction: Correction | None = None) -> Float[np.ndarray, "4 4"]:
-        """From the first camera's axes to the second's."""
-        poses = self.cameras.world_from_camera[[pair.first, pair.second]]
-        poses = poses if correction is None else correction.of_poses(poses)
-        return np.asarray(np.linalg.inv(poses[1]) @ poses[0])
-
-    def log_ratio(
+    def log_ratios(
         self,
-        pair: Pair,
+        pairs: Sequence[Pair],
         *,
-        motion: Float[np.ndarray, "4 4"] | None = None,
+        motions: Float[np.ndarray, "m 4 4"] | None = None,
         correction: Correction | None = None,
         along_ray: bool = False,
         every: int = 1,
-    ) -> Float[np.ndarray, "p"]:
+    ) -> list[Float[np.ndarray, "_"]]:
         """Log of the depth that the second frame has where the first one's points fall, over theirs.
 
         Between pixels the inverse of depth is interpolated, which is linear over a plane. NaN where the
         pixels round a point are not of one surface, or unknown, or outside the image.
 
         Args:
-            pair: of frames.
-            motion: from the first camera's axes to the second's, in place of that of the poses.
+            pairs: of frames.
+            motions: from the first camera's axes to the second's, in place of those of the poses.
             correction: of what is common to all frames.
             along_ray: read depth as the distance along the ray.
             every: carry one in so many of the points.
+
+        Returns:
+            Of each pair, one for each of its points.
         """
-        K = self.cameras.K[[pair.first, pair.second]]
-        centers, z = (part[::every] for part in self._carried(pair.first))
+        cameras = self.cameras
         if correction is not None:
-            K, z = correction.of_intrinsics(K, self.sequence.width / self._stride), correction.of_depth(z)
-        points = unproject_pixels(centers, K[0], self.cameras.lens) * z[:, None]
+            K, lens = correction.of_lens(cameras.K, cameras.lens, cameras.width, cameras.height)
+            poses = correction.of_poses(cameras.world_from_camera)
+            cameras = replace(cameras, K=K, lens=lens, world_from_camera=poses)
+        if motions is None:
+            first, second = ([getattr(pair, which) for pair in pairs] for which in ("first", "second"))
+            poses = cameras.world_from_camera
+            motions = np.linalg.inv(poses[second]) @ poses[first]
+        found = []
+        for begin in range(0, len(pairs), CARRIED_TOGETHER):
+            some = slice(begin, begin + CARRIED_TOGETHER)
+            found += self._log_ratios(pairs[some], cameras, motions[some], correction, along_ray, every)
+        return found
+
+    def _log_ratios(
+        self,
+        pairs: Sequence[Pair],
+        cameras: Cameras,
+        motions: Float[np.ndarray, "m 4 4"],
+        correction: Correction | None,
+        along_ray: bool,
+        every: int,
+    ) -> list[Float[np.ndarray, "_"]]:
+        """`log_ratios` of a few pairs, by cameras that are corrected already."""
+        K, lens, height, width = cameras.K, cameras.lens, cameras.height, cameras.width
+        first, second = np.array([(pair.first, pair.second) for pair in pairs]).T
+        of_first = [self._carried(position) for position in first.tolist()]
+        centers = np.concatenate([centers[::every] for centers, _ in of_first])
+        z = np.concatenate([depth[::every] for _, depth in of_first])
+        counts = [len(depth[::every]) for _, depth in of_first]
+        z = z if correction is None else correction.of_depth(z)
+        points = unproject_pixels(centers, np.repeat(K[first], counts, axis=0), lens) * z[:, None]
         if along_ray:
             points = points * (z / np.linalg.norm(points, axis=1))[:, None]
-        motion = self.motion(pair, correction) if motion is None else motion
-        carried = transform_points(motion, points)
+        carried = transform_points(np.repeat(motions, counts, axis=0), points)
         reached = np.linalg.norm(carried, axis=1) if along_ray else carried[:, 2]
-        pixels = project_points(carried, K[1], self.cameras.lens) - 0.5
-        inverse = self._inverse(pair.second)
-        height, width = inverse.shape
+        pixels = project_points(carried, np.repeat(K[second], counts, axis=0), lens) - 0.5
         with np.errstate(invalid="ignore"):
             inside = (pixels >= 0).all(1) & (pixels[:, 0] < width - 1) & (pixels[:, 1] < height - 1)
         inside &= (carried[:, 2] > 0) & (z > 0)
         column, row = np.floor(pixels[inside]).astype(np.int64).T
         right, down = (pixels[inside] - np.stack([column, row], axis=1)).T
-        corners = np.stack([inverse[row + j, column + i] for j in (0, 1) for i in (0, 1)])
+        corners = np.empty((4, len(row)))
+        ends = np.cumsum([0, *(part.sum() for part in np.split(inside, np.cumsum(counts)[:-1]))]).tolist()
+        for position, begin, end in zip(second.tolist(), ends[:-1], ends[1:], strict=True):
+            inverse, v, u = self._inverse(position), row[begin:end], column[begin:end]
+            for corner, (j, i) in enumerate(((0, 0), (0, 1), (1, 0), (1, 1))):
+                corners[corner, begin:end] = inverse[v + j, u + i]
         shares = np.stack([(1 - down) * (1 - right), (1 - down) * right, down * (1 - right), down * right])
         nearest, farthest = corners.max(0), corners.min(0)
         one_surface = (farthest > 0) & (nearest < np.exp(SMOOTH_STEP) * farthest)
@@ -222,7 +279,7 @@ class CarriedDepth:
             )
         found = np.full(len(z), np.nan)
         found[inside] = np.where(one_surface & (np.abs(ratio) < SAME_SURFACE), ratio, np.nan)
-        return found
+        return np.split(found, np.cumsum(counts)[:-1])
 
     def beyond_motion(self, pair: Pair) -> Float[np.ndarray, "p"]:
         """Log-ratios of a pair after the rigid motion between its cameras that makes them smallest.
@@ -230,11 +287,12 @@ class CarriedDepth:
         Gauss-Newton with the weights of a Cauchy distribution; the derivatives by differences, so that they
         hold for any lens.
         """
-        motion, length = self.motion(pair), float(self.typical[pair.first])
+        poses, length = self.cameras.world_from_camera, float(self.typical[pair.first])
+        motion = np.linalg.inv(poses[pair.second]) @ poses[pair.first]
         best = ratio = self.ratio(pair)
         for _ in range(ROUNDS):
-            steps = STEP * np.eye(6)
-            moved = [self.log_ratio(pair, motion=_moved(motion, step, length)) for step in steps]
+            steps = np.stack([_moved(motion, step, length) for step in STEP * np.eye(6)])
+            moved = self.log_ratios([pair] * len(steps), motions=steps)
             J = (np.stack(moved, axis=1) - ratio[:, None]) / STEP
             both = np.isfinite(ratio) & np.isfinite(J).all(1)
             if both.sum() < LEAST_POINTS:
@@ -243,7 +301,7 @@ class CarriedDepth:
             root = 1 / np.sqrt(1 + (ratio[both] / (2 * spread)) ** 2)
             step, *_ = np.linalg.lstsq(root[:, None] * J[both], -root * ratio[both], rcond=1e-6)
             motion = _moved(motion, step, length)
-            ratio = self.log_ratio(pair, motion=motion)
+            (ratio,) = self.log_ratios([pair], motions=motion[None])
             if relative_error([ratio]) < relative_error([best]):
                 best = ratio
         return best
@@ -260,9 +318,8 @@ class CarriedDepth:
         sources = select_sources(poses, K, size, typical, COMPARED_WITH, chosen)
         found = []
         for position in chosen.tolist():
-            for other in sources[position][sources[position] >= 0].tolist():
-                pair = Pair(position, other)
-                ratio = self.log_ratio(pair)
+            pairs = [Pair(position, other) for other in sources[position].tolist() if other >= 0]
+            for pair, ratio in zip(pairs, self.log_ratios(pairs), strict=True):
                 if np.isfinite(ratio).sum() >= LEAST_POINTS:
                     self._ratios[pair] = ratio
                     found.append(pair)
@@ -307,7 +364,7 @@ def relative_error(ratios: list[Float[np.ndarray, "_"]]) -> float:
     many of the one as of the other, in one direction of a pair or in both. NaN does not count.
 
     Args:
-        ratios: from `CarriedDepth.log_ratio`.
+        ratios: from `CarriedDepth.log_ratios`.
     """
     known = np.concatenate([ratio[ratio > 0] for ratio in ratios]) if ratios else np.zeros(0)
     return float(np.median(known) / MEDIAN) if len(known) else 0.0

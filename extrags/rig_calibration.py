@@ -24,6 +24,7 @@ from extrags.carried_depth import (
     evenly,
     relative_error,
 )
+from extrags.errors import SourceError
 from extrags.sequence import EndoscopicSequence
 
 __all__ = ["with_calibration_corrected"]
@@ -47,7 +48,13 @@ SIMPLER = 0.8
 FITTED_PAIRS = 60
 """Pairs at most that a correction is fitted to."""
 
-EVERY = 3
+TRIED_PAIRS = 12
+"""Pairs that a correction is tried on first."""
+
+HOPEFUL = 1.5
+"""So many times as much as is left of what is corrected may be left of these."""
+
+EVERY = 5
 """One in so many points of a frame is used."""
 
 CORRECTIONS = 3
@@ -55,6 +62,18 @@ CORRECTIONS = 3
 
 ROUNDS = 10
 """Of reweighted least squares."""
+
+LAST_ROUNDS = 3
+"""Of these on all pairs, from where the tried ones arrived."""
+
+PATIENCE = 3
+"""Steps after which so much less has to be left, where the correction is the one."""
+
+HOPELESS = 0.75
+"""Share of the disagreement that is."""
+
+HALVINGS = 5
+"""Of a step, at most, after which the lens would fold back inside the image."""
 
 STEP = 1e-3
 """Of the derivatives, in the scale of each number."""
@@ -70,7 +89,7 @@ class _Family:
     Args:
         words: what is corrected, for the warning.
         scale: of each number, which is about the error that it can have.
-        made: the correction of numbers in these scales.
+        made: the correction of its numbers.
         told: numbers of a correction, in words.
     """
 
@@ -78,6 +97,10 @@ class _Family:
     scale: tuple[float, ...]
     made: Callable[[Float[np.ndarray, "k"]], Correction]
     told: Callable[[Correction], str]
+
+    def of(self, numbers: Float[np.ndarray, "k"]) -> Correction:
+        """The correction of numbers that are given in their scales."""
+        return self.made(np.array(self.scale) * numbers)
 
 
 def _families(length: float) -> tuple[_Family, ...]:
@@ -95,6 +118,18 @@ def _families(length: float) -> tuple[_Family, ...]:
             lambda x: Correction(log_focal=_two(x[:2]), shift=_two(x[2:])),
             lambda c: (
                 "focal lengths are multiplied by {:.3f} and {:.3f}, ".format(*np.exp(c.log_focal))
+                + "the principal point is moved by ({:+.2f}, {:+.2f}) % of the width".format(
+                    *(100 * part for part in c.shift)
+                )
+            ),
+        ),
+        _Family(
+            "the lens is not the pinhole it is said to be",
+            (0.05, 0.05, 0.02, 0.02, 0.15),
+            lambda x: Correction(log_focal=_two(x[:2]), shift=_two(x[2:4]), distortion=float(x[4])),
+            lambda c: (
+                f"it distorts radially (division model, k = {c.distortion:+.3f}), "
+                + "focal lengths are multiplied by {:.3f} and {:.3f}, ".format(*np.exp(c.log_focal))
                 + "the principal point is moved by ({:+.2f}, {:+.2f}) % of the width".format(
                     *(100 * part for part in c.shift)
                 )
@@ -127,11 +162,12 @@ def with_calibration_corrected(
 ) -> EndoscopicSequence:
     """The sequence with what its frames have in common corrected, where their depth tells it clearly.
 
-    Depth along the ray becomes z-depth. Of depth's unit and offset, of focal lengths and principal point, and
-    of a turn and shift of the camera on what is tracked, the one is corrected that leaves least of the
-    disagreement, if that is a quarter of it at most, or unit, offset, turn and shift together; of all frames,
-    held-out ones too. What is left then may be explained by another. A warning says what, and by how much.
-    The sequence is returned as it is where nothing is off, or nothing of this explains it.
+    Depth along the ray becomes z-depth. Of depth's unit and offset, of focal lengths and principal point, of
+    these with a radial distortion, and of a turn and shift of the camera on what is tracked, the one is
+    corrected that leaves least of the disagreement, if that is a quarter of it at most, or unit, offset, turn
+    and shift together; of all frames, held-out ones too. What is left then may be explained by another. A
+    warning says what, and by how much. The sequence is returned as it is where nothing is off, or nothing of
+    this explains it.
 
     Args:
         sequence: in any unit.
@@ -153,69 +189,109 @@ def _corrected_once(sequence: EndoscopicSequence, carried: CarriedDepth, lens: b
     error = relative_error([carried.ratio(pair) for pair in pairs])
     if error < LEAST_ERROR:
         return sequence
-    along_ray = relative_error([carried.log_ratio(pair, along_ray=True) for pair in pairs])
+    along_ray = relative_error(carried.log_ratios(pairs, along_ray=True))
     if along_ray < CLEARLY_LESS * error:
         _warn(sequence, error, along_ray, "depth is the distance along the ray", "it is converted to z-depth")
         return sequence.with_changed_depth(lambda frame, depth: depth / _ray_lengths(sequence, frame))
+    some = [pairs[k] for k in evenly(len(pairs), TRIED_PAIRS).tolist()]
+    hopeful = HOPEFUL * CLEARLY_LESS * relative_error([carried.ratio(pair) for pair in some])
     best, left, family = Correction(), CLEARLY_LESS * error, None
     families = _families(float(np.median(carried.typical[carried.typical > 0])))
     # Points of the source were found with its poses and lens, and do not follow another.
-    may_change = (True, lens, True, True) if sequence.points is None else (True, False, False, False)
+    rig = sequence.points is None
+    may_change = (True, lens and rig, lens and rig and sequence.lens is None, rig, rig)
     for candidate in (family for family, may in zip(families, may_change, strict=True) if may):
-        found = _fitted(carried, pairs, candidate)
-        if found is None:
+        numbers = _fitted(carried, some, candidate, np.zeros(len(candidate.scale)), ROUNDS)
+        if numbers is None or _left(carried, some, candidate, numbers) > hopeful:
             continue
-        remains = relative_error([carried.log_ratio(pair, correction=found) for pair in pairs])
+        numbers = _fitted(carried, pairs, candidate, numbers, LAST_ROUNDS)
+        if numbers is None:
+            continue
+        found, remains = candidate.of(numbers), _left(carried, pairs, candidate, numbers)
         if remains < (left if family is None else SIMPLER * left):
             best, left, family = found, remains, candidate
     if family is None:
         return sequence
     _warn(sequence, error, left, family.words, family.told(best))
+    K, radial = best.of_lens(sequence.K, sequence.lens, sequence.width, sequence.height)
     return replace(
         sequence.with_changed_depth(lambda _, depth: best.of_depth(depth)),
-        K=best.of_intrinsics(sequence.K, float(sequence.width)),
+        K=K,
+        lens=radial,
         world_from_camera=best.of_poses(sequence.cameras.world_from_camera),
     )
 
 
-def _fitted(carried: CarriedDepth, pairs: list[Pair], family: _Family) -> Correction | None:
-    """The correction of a family that leaves the least disagreement.
+def _left(
+    carried: CarriedDepth, pairs: list[Pair], family: _Family, numbers: Float[np.ndarray, "k"]
+) -> float:
+    """Disagreement that a correction leaves."""
+    return relative_error(carried.log_ratios(pairs, correction=family.of(numbers)))
+
+
+def _fitted(
+    carried: CarriedDepth,
+    pairs: list[Pair],
+    family: _Family,
+    numbers: Float[np.ndarray, "k"],
+    rounds: int,
+) -> Float[np.ndarray, "k"] | None:
+    """The correction of a family that leaves the least disagreement, in the scales of its numbers.
 
     Gauss-Newton with the weights of a Cauchy distribution; the derivatives by differences, so that they hold
     for any lens.
 
-    Returns:
-        None where the correction would be implausibly large, or too few points meet depth with it.
-    """
-    numbers = np.zeros(len(family.scale))
-    scale = np.array(family.scale)
+    Args:
+        carried: depth of the training frames.
+        pairs: those that are looked at.
+        family: what may be corrected.
+        numbers: where to start.
+        rounds: steps at most.
 
-    def ratios(numbers: Float[np.ndarray, "k"]) -> Float[np.ndarray, "p"]:
-        correction = family.made(scale * numbers)
-        parts = [carried.log_ratio(pair, correction=correction, every=EVERY) for pair in pairs]
+    Returns:
+        None where the correction would be implausibly large, or too few points meet depth with it, or where
+        the first steps hardly bring anything.
+    """
+
+    def ratios(numbers: Float[np.ndarray, "k"]) -> Float[np.ndarray, "p"] | None:
+        """None where the lens would fold back inside the image."""
+        try:
+            parts = carried.log_ratios(pairs, correction=family.of(numbers), every=EVERY)
+        except SourceError:
+            return None
         return np.concatenate(parts)
 
-    for _ in range(ROUNDS):
-        ratio = ratios(numbers)
-        J = np.stack(
-            [(ratios(numbers + STEP * axis) - ratio) / STEP for axis in np.eye(len(numbers))], axis=1
-        )
+    ratio = ratios(numbers)
+    started = relative_error([] if ratio is None else [ratio])
+    for done in range(rounds):
+        moved = [ratios(numbers + STEP * axis) for axis in np.eye(len(numbers))]
+        if ratio is None or any(part is None for part in moved):
+            return None
+        if done == PATIENCE and relative_error([ratio]) > HOPELESS * started:
+            return None
+        J = np.stack([(part - ratio) / STEP for part in moved if part is not None], axis=1)
         known = np.isfinite(ratio) & np.isfinite(J).all(1)
         if known.sum() < LEAST_POINTS:
             return None
         spread = max(relative_error([ratio]) * np.sqrt(2), 1e-6)
-        weight = 1 / (1 + (ratio[known] / (2 * spread)) ** 2)
-        A = (weight[:, None] * J[known]).T @ J[known]
+        weighted = J[known] / (1 + (ratio[known, None] / (2 * spread)) ** 2)
+        # Not by BLAS, whose sums depend on the number of threads.
+        A = np.einsum("pk,pl->kl", weighted, J[known])
         # Where cameras do not turn, a shift of all of them changes nothing; no pair tells it then.
         A += HELD * np.trace(A) / len(A) * np.eye(len(A))
-        step = np.linalg.solve(A, -(weight[:, None] * J[known]).T @ ratio[known])
+        step = np.linalg.solve(A, -np.einsum("pk,p->k", weighted, ratio[known]))
         step /= max(1.0, float(np.abs(step).max()))
+        for _ in range(HALVINGS):
+            ratio = ratios(numbers + step)
+            if ratio is not None:
+                break
+            step /= 2
         numbers = numbers + step
         if np.abs(numbers).max() >= PLAUSIBLE:
             return None
         if np.abs(step).max() < STEP:
             break
-    return family.made(scale * numbers)
+    return numbers
 
 
 def _warn(sequence: EndoscopicSequence, error: float, left: float, found: str, done: str) -> None:

@@ -25,7 +25,7 @@ def lens_settings(config: IngestConfig) -> IngestConfig:
     return IngestConfig(**{name: getattr(config, name) for name in kept})
 
 
-@stage("poses", version=14)
+@stage("poses", version=15)
 def poses(slot: Slot, sequence: Ref, config: PosesConfig, ingest: IngestConfig | None = None) -> None:
     """Estimate poses; writes `sequence/` without the frames that could not be registered, and `poses.json`.
 

@@ -33,7 +33,7 @@ from extrags.sequence import EndoscopicSequence
 from extrags.training import reconstruct
 from extrags.training.pose_refinement import with_refined_poses
 from extrags.training.starting import median_depth
-from tests.benchmarks.wrong_recordings import WRONG
+from tests.benchmarks.wrong_recordings import OTHERWISE_RECORDED, WRONG
 
 GAMMA = 2.2
 SHIFT_SHARE, TURN_DEG = 0.01, 0.5
@@ -79,7 +79,8 @@ def cases(given: argparse.Namespace) -> Iterator[dict[str, Any]]:
             wrong = WRONG[change](sequence)
             for setting, frames in (("without", wrong), ("with", with_corrections(wrong))):
                 case = {"sequence": name, "change": change, "setting": setting, "seed": given.seed}
-                yield case | of_wrong(frames, sequence, base)
+                right = wrong if change in OTHERWISE_RECORDED else sequence
+                yield case | of_wrong(frames, right, base)
 
 
 def measured(sequence: EndoscopicSequence, config: PipelineConfig, *, whole: bool) -> dict[str, Any]:

@@ -12,9 +12,11 @@ from scipy.spatial.transform import Rotation
 from extrags.cameras import pixel_rays
 from extrags.sequence import EndoscopicSequence
 
-__all__ = ["WRONG"]
+__all__ = ["OTHERWISE_RECORDED", "WRONG", "distorted"]
 
 Sequence = EndoscopicSequence
+
+GAMMA = 2.2
 
 
 def _depths(sequence: Sequence, changed: Callable[[int, np.ndarray], np.ndarray]) -> Sequence:
@@ -64,10 +66,52 @@ def _lens(sequence: Sequence, focal: float = 1.0, shift_px: tuple[float, float] 
     return replace(sequence, K=K)
 
 
+def distorted(sequence: Sequence, coefficients: tuple[float, float] = (-0.08, 0.0)) -> Sequence:
+    """All frames as a lens of this k1 and k2 records them, though it is said to be a pinhole."""
+    assert sequence.depth_mm is not None
+    v, u = np.mgrid[: sequence.height, : sequence.width] + 0.5
+    rgb, depth, mask = (np.array(part) for part in (sequence.rgb, sequence.depth_mm, sequence.mask))
+    for k, K in enumerate(sequence.K):
+        seen = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]], axis=-1)
+        rays = cv2.undistortPoints(seen.reshape(-1, 1, 2), np.eye(3), np.array([*coefficients, 0, 0]))
+        x, y = (
+            (rays.reshape(seen.shape) * K[[0, 1], [0, 1]] + K[:2, 2] - 0.5)
+            .astype(np.float32)
+            .transpose(2, 0, 1)
+        )
+        inside = (x >= 0) & (y >= 0) & (x <= sequence.width - 1) & (y <= sequence.height - 1)
+        known = (depth[k] > 0).astype(np.float32)
+        inverse = cv2.remap(1 / np.maximum(depth[k], 1e-6) * known, x, y, cv2.INTER_LINEAR)
+        inside &= cv2.remap(mask[k].astype(np.uint8), x, y, cv2.INTER_NEAREST) > 0
+        known = inside & (cv2.remap(known, x, y, cv2.INTER_LINEAR) > 0.999)
+        depth[k] = np.where(known, 1 / np.maximum(inverse, 1e-6), 0)
+        rgb[k], mask[k] = cv2.remap(rgb[k], x, y, cv2.INTER_CUBIC), inside
+    return replace(sequence, rgb=rgb, depth_mm=depth, mask=mask)
+
+
 def _hand_eye(sequence: Sequence) -> Sequence:
     further = np.eye(4)
     further[:3, 3] = 1.6, -1.2, 0.0
     return replace(sequence, world_from_camera=sequence.cameras.world_from_camera @ further)
+
+
+def _developed(sequence: Sequence, changed: Callable[[int, np.ndarray], np.ndarray]) -> Sequence:
+    """With the linear light of training frames changed; in the order of the recording."""
+    rgb = np.array(sequence.rgb)
+    for place, frame in enumerate(np.sort(sequence.train).tolist()):
+        light = changed(place, (rgb[frame] / 255.0) ** GAMMA)
+        rgb[frame] = np.rint(255 * light.clip(0, 1) ** (1 / GAMMA))
+    return replace(sequence, rgb=rgb)
+
+
+def _white_balance(place: int, light: np.ndarray) -> np.ndarray:
+    red, blue = np.exp(0.15 * np.random.default_rng([505, place]).normal(size=2))
+    return np.asarray(light * [red, 1.0, blue])
+
+
+def _haze(count: int) -> Callable[[int, np.ndarray], np.ndarray]:
+    """Smoke or a fogged lens in the middle third: it takes a third of the light and scatters its own."""
+    return lambda place, light: 0.65 * light + 0.1 if place * 3 // count == 1 else light
 
 
 def _blank(sequence: Sequence) -> Sequence:
@@ -96,8 +140,14 @@ WRONG: dict[str, Callable[[Sequence], Sequence]] = {
     "ray": _along_ray,
     "focal": lambda sequence: _lens(sequence, 1.05),
     "principal": lambda sequence: _lens(sequence, shift_px=(1.6, 1.2)),
+    "distorted": distorted,
     "hand-eye": _hand_eye,
+    "white balance": lambda sequence: _developed(sequence, _white_balance),
+    "haze": lambda sequence: _developed(sequence, _haze(len(sequence.train))),
     "blank": _blank,
     "misplaced": _misplaced,
 }
 """What is wrong, by its name on the command line."""
+
+OTHERWISE_RECORDED = ("distorted",)
+"""Those whose frames show other rays than the right ones: they are measured against themselves."""

@@ -5,14 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from extrags.cameras import pixel_rays
+from extrags.cameras import pixel_rays, project_points
 from extrags.carried_depth import CarriedDepth, Correction, relative_error
+from extrags.errors import SourceError
+from extrags.lens import Lens
 from extrags.rig_calibration import with_calibration_corrected as corrected
 from extrags.sequence import EndoscopicSequence
+from tests.benchmarks.wrong_recordings import distorted
 from tests.extrags.depth.withheld import recorded
 from tests.extrags.test_measured_depth import displaced, smoothly_wrong, with_depth
 
@@ -77,6 +81,34 @@ def test_what_is_off_is_found_again(
     np.testing.assert_allclose(motions(found), motions(exact), atol=0.02)
 
 
+@pytest.mark.parametrize(
+    "coefficients", [(-0.05, 0.0), (-0.3, 0.08), (0.1, 0.0)], ids=["barrel", "strong barrel", "pincushion"]
+)
+def test_a_lens_that_is_no_pinhole_is_found(
+    exact: EndoscopicSequence, coefficients: tuple[float, float], caplog: pytest.LogCaptureFixture
+) -> None:
+    found = with_calibration_corrected(distorted(exact, coefficients))
+    assert "it distorts radially" in caplog.text
+    K = exact.K[0]
+    rays = np.stack(np.meshgrid(np.linspace(-0.8, 0.8, 9), np.linspace(-0.6, 0.6, 7), [1.0]), axis=-1)
+    expected, _ = cv2.projectPoints(
+        rays.reshape(-1, 1, 3), np.zeros(3), np.zeros(3), K, np.array([*coefficients, 0, 0])
+    )
+    pixels = project_points(rays.reshape(-1, 3), found.K[0], found.lens)
+    assert np.abs(pixels - expected[:, 0]).max() < 0.4
+
+
+def test_what_is_no_pinhole_already_keeps_its_lens(exact: EndoscopicSequence) -> None:
+    lens = Lens.pinhole(exact.K[0], exact.width, exact.height).radial().lens
+    given = replace(distorted(exact, (-0.05, 0.0)), lens=lens)
+    assert with_calibration_corrected(given).lens is lens
+
+
+def test_a_lens_that_folds_back_inside_the_image_is_no_correction(exact: EndoscopicSequence) -> None:
+    with pytest.raises(SourceError):
+        Correction(distortion=3.0).of_lens(exact.K, None, exact.width, exact.height)
+
+
 def test_depth_along_the_ray_is_converted(
     exact: EndoscopicSequence, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -118,7 +150,7 @@ def test_unit_and_hand_eye_are_found_together(exact: EndoscopicSequence) -> None
     given = with_depth(with_hand_eye(0, 2)(exact), lambda _, depth: 1.1 * depth)
     found = with_calibration_corrected(given)
     before, after = (
-        relative_error([carried.log_ratio(pair) for pair in carried.pairs])
+        relative_error(carried.log_ratios(carried.pairs))
         for carried in (CarriedDepth(given), CarriedDepth(found))
     )
     assert after < 0.05 * before
@@ -128,7 +160,7 @@ def test_larger_maps_are_looked_up_at_every_other_pixel(exact: EndoscopicSequenc
     large = recorded(3, 400, 300)
     carried = CarriedDepth(large)
     assert carried.cameras.width == 200
-    assert relative_error([carried.log_ratio(pair) for pair in carried.pairs]) < 1e-3
+    assert relative_error(carried.log_ratios(carried.pairs)) < 1e-3
 
 
 def test_corrections_keep_what_is_unknown_and_undo_each_other(exact: EndoscopicSequence) -> None:
