@@ -36,8 +36,8 @@ def evaluated(source: str, config: extrags.PipelineConfig) -> extrags.Evaluation
     """Reconstruct a source and evaluate it, the registered metrics included."""
     sequence = extrags.read(source, config.ingest)
     found = extrags.reconstruct(sequence, config.coarse)
-    if found.refined is not None:  # poses that did not agree with the images were corrected
-        sequence = extrags.with_refined_poses(sequence, found.refined.world_from_camera)
+    # Poses that did not agree with the images, and haze, are corrected.
+    sequence = extrags.as_reconstructed(sequence, found)
     result = extrags.evaluate(found.scene, sequence)
     for name in ("psnr", CHROMA_ERROR.key):
         observed = result.metrics["observed"][name]

@@ -25,8 +25,8 @@ def reconstructed(source: str, config: extrags.PipelineConfig) -> tuple[extrags.
         estimate = extrags.estimate_poses(sequence, config.poses)
         sequence = extrags.with_estimated_poses(sequence, estimate)
     found = extrags.reconstruct(sequence, config.coarse)
-    if found.refined is not None:  # poses that did not agree with the images were corrected
-        sequence = extrags.with_refined_poses(sequence, found.refined.world_from_camera)
+    # Poses that did not agree with the images, and haze, are corrected.
+    sequence = extrags.as_reconstructed(sequence, found)
     return found.scene, sequence.training_cameras
 
 

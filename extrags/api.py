@@ -55,7 +55,7 @@ from extrags.scene_plan import ScenePlan
 from extrags.sequence import EndoscopicSequence, Split
 from extrags.stages import STAGES
 from extrags.surface import Mesh, fuse_surface
-from extrags.training import TrainingResult, finetune, reconstruct
+from extrags.training import TrainingResult, as_reconstructed, finetune, reconstruct
 from extrags.training.pose_refinement import with_refined_poses
 
 __all__ = [
@@ -97,6 +97,7 @@ __all__ = [
     "SurfaceConfig",
     "TrainingResult",
     "UcNerfConfig",
+    "as_reconstructed",
     "assess",
     "carve",
     "estimate_depth",

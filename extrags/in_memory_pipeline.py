@@ -211,7 +211,7 @@ class InMemoryPipeline(Pipeline):
     def coarse(self) -> None:
         """`extrags.training.reconstruct` on the training frames alone, or an imported scene."""
         from extrags.training import reconstruct
-        from extrags.training.pose_refinement import with_refined_poses
+        from extrags.training.reconstruction import as_reconstructed
 
         with self._timed("coarse"):
             self._training = self._with_depth(self.result.sequence.training_part())
@@ -226,11 +226,10 @@ class InMemoryPipeline(Pipeline):
             frames = self._with_depth(self.result.sequence) if oracle else self._training
             found = reconstruct(frames, self.config.coarse, device=self._device)
             found = replace(found, scene=found.scene.to("cpu"))
-            if found.refined is not None:
-                # The scene was optimised with the corrected poses: later stages need them.
-                refined = with_refined_poses(self.result.sequence, found.refined.world_from_camera)
-                self.result.sequence = refined
-                self._training = self._with_depth(refined.training_part())
+            if found.corrects_frames:
+                # The scene was optimised with the corrected poses and colours: later stages need them.
+                self.result.sequence = as_reconstructed(self.result.sequence, found)
+                self._training = self._with_depth(self.result.sequence.training_part())
             self.result.reconstruction = found
 
     def assess(self) -> None:
@@ -324,8 +323,8 @@ class InMemoryPipeline(Pipeline):
                     self.result.pseudo_views if judgement.amount > 0 else None,
                     judgement.applied_to(self.config.finetune),
                     self.config.coarse,
-                    # Where poses were refined, frames are compared anew through these.
-                    frame_weights=None if made is None or made.refined is not None else made.frame_weights,
+                    # Frames that were corrected are compared anew.
+                    frame_weights=None if made is None or made.corrects_frames else made.frame_weights,
                 )
                 self.result.finetuning = replace(found, scene=found.scene.to("cpu"))
 

@@ -92,6 +92,7 @@ class Scene(Storable):
         exposure: Float[Tensor, "c"] | None = None,
         sh_degree: int | None = None,
         viewmats: Float[Tensor, "c 4 4"] | None = None,
+        camera_light: CameraLight | None = None,
         **options: Any,
     ) -> Rendering:
         """Render all cameras, on the scene's device.
@@ -101,6 +102,7 @@ class Scene(Storable):
             exposure: gain per camera, on any device; None is the mean exposure of the training frames.
             sh_degree: use spherical harmonics up to this degree only.
             viewmats: world-to-camera matrices that replace those of the cameras; differentiable.
+            camera_light: of the cameras, in place of the scene's at these exposures.
             options: further arguments of `extrags.raster.rasterize` (visibility, query_points, ...).
 
         Returns:
@@ -116,7 +118,7 @@ class Scene(Storable):
             self.gaussians.sh,
             viewmats=viewmats,
             sh_degree=degree if sh_degree is None else min(sh_degree, degree),
-            light=self._camera_light(len(cameras), exposure),
+            light=self._camera_light(len(cameras), exposure) if camera_light is None else camera_light,
             **options,
         )
 

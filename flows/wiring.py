@@ -215,12 +215,15 @@ class SequenceRun(CachedStages):
             counts = self._manifest("coarse").counts
             if counts.get("continued_from"):
                 said.append(str(counts["summary"]))
-            if counts.get("refined_poses"):
-                # The scene was optimised with the corrected poses: later stages need them.
+            if counts.get("refined_poses") or counts.get("corrected_colors"):
+                # The scene was optimised with the corrected poses and colours: later stages need them.
                 inputs = {"sequence": self.refs["sequence"], "coarse": self.refs["coarse"]}
                 self.refs["sequence"] = self._run_uncounted(Call(refined_frames, inputs))
                 self.refs["training"] = self._training_frames()
+            if counts.get("refined_poses"):
                 said.append(f"poses refined, by {counts['refined_mean_turn_deg']:.2f} degrees on average")
+            if counts.get("corrected_colors"):
+                said.append("haze or white balance of single frames corrected")
             if counts.get("inconsistent_frames"):
                 said.append(str(counts["inconsistent_frames"]))
             row.reason = "; ".join(said)

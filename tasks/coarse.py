@@ -74,15 +74,24 @@ def save_reconstruction(slot: Slot, frames: EndoscopicSequence, result: Training
         slot.save(result.refined)
         slot.counts["refined_mean_shift"] = result.refined.mean_shift
         slot.counts["refined_mean_turn_deg"] = result.refined.mean_turn_deg
+    slot.counts["corrected_colors"] = int(result.colors is not None)
+    if result.colors is not None:
+        slot.save(result.colors)
 
 
-@stage("refined-frames", version=3)
+@stage("refined-frames", version=4)
 def refined_frames(slot: Slot, sequence: Ref, coarse: Ref) -> None:
-    """The whole sequence with the refined poses of the coarse stage; writes `sequence/`."""
+    """The whole sequence with the poses and colours that the coarse stage corrected; writes `sequence/`."""
+    from extrags.scene import Scene
     from extrags.sequence import EndoscopicSequence
+    from extrags.training.frame_colors import FrameColors, with_corrected_colors
     from extrags.training.pose_refinement import RefinedPoses, with_refined_poses
 
-    refined = slot.load(RefinedPoses, coarse)
-    whole = with_refined_poses(slot.load(EndoscopicSequence, sequence), refined.world_from_camera)
+    whole, found = slot.load(EndoscopicSequence, sequence), slot.store.manifest(coarse).counts
+    if found.get("refined_poses"):
+        whole = with_refined_poses(whole, slot.load(RefinedPoses, coarse).world_from_camera)
+    light = slot.load(Scene, coarse).light
+    if found.get("corrected_colors") and light is not None:
+        whole = with_corrected_colors(whole, slot.load(FrameColors, coarse), light)
     slot.save(whole)
     slot.counts.update(frames=len(whole), train=len(whole.train), test=len(whole.test))

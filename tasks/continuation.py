@@ -193,6 +193,8 @@ def _refusal(manifest: Manifest, config: CoarseConfig) -> str:
         return f"it was made by another version of the stage, {manifest.version}"
     if manifest.counts.get("refined_poses"):
         return "its poses were refined"
+    if manifest.counts.get("corrected_colors"):
+        return "the colours of its frames were corrected"
     settings = _settings(manifest)
     return "its settings cannot be read" if settings is None else other_settings(settings, config)
 

@@ -64,7 +64,7 @@ def judge(
     slot.counts["amount"] = judgement.amount
 
 
-@stage("finetune", version=23)
+@stage("finetune", version=24)
 def finetune(
     slot: Slot,
     scene: Ref,
@@ -85,10 +85,11 @@ def finetune(
     from extrags.sequence import EndoscopicSequence
     from extrags.training.frame_weights import FrameWeights
 
-    # Of the coarse stage. Where it refined poses, frames are compared anew through these.
+    # Of the coarse stage. Frames whose poses or colours it corrected are compared anew.
     known = (slot.open(scene) / FrameWeights.stored_as).exists()
-    refined = bool(slot.store.manifest(scene).counts.get("refined_poses"))
-    weights = slot.load(FrameWeights, scene) if known and not refined else None
+    counts = slot.store.manifest(scene).counts
+    corrected = bool(counts.get("refined_poses") or counts.get("corrected_colors"))
+    weights = slot.load(FrameWeights, scene) if known and not corrected else None
     start, frames = slot.load(Scene, scene), slot.load(EndoscopicSequence, sequence)
     start = start.to(chosen_device(device, "device"))
     with keep_last_finite_scene(slot):

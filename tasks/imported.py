@@ -59,6 +59,7 @@ def imported_scene(slot: Slot, sequence: Ref, digest: str, scale: float, file: s
         training_psnr=found.psnr,
         random_start=0,
         refined_poses=0,
+        corrected_colors=0,
         summary=f"imported from {Path(file).name}, {found.psnr:.1f} dB on the training frames; "
         + "; ".join(found.statements),
     )

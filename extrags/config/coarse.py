@@ -57,6 +57,10 @@ class LightConfig(StageConfig):
         description="glare is kept where black is at least this bright, in the mean of the colours; less is "
         "also found where there is no glare, and distorts the fall-off",
     )
+    frame_colors: bool = Field(
+        True,
+        description="learn haze and white balance of single frames, and take away what there is of them",
+    )
     exposure_learning_rate: float = Field(0.005, gt=0, description="of the exposure per frame")
     exposure_prior: float = Field(
         0.1,

@@ -30,7 +30,7 @@ class FillingStep:
 
     def __init__(self, scene: Scene, schedule: Schedule, fixed: int) -> None:
         self._step: TrainingStep = training_step(scene, schedule)
-        self.adam = self._step.adam
+        self.adam, self.colors = self._step.adam, self._step.colors
         self._kept = {
             name: values[:fixed] for name, values in scene.detached().gaussians.parameters().items()
         }
@@ -57,7 +57,7 @@ class FillingStep:
 
 def filling_schedule(schedule: Schedule) -> Schedule:
     """The same schedule with the number of Gaussians and the light as they are."""
-    learned = ("falloff", "spread", "cosine", "response", "specular", "exposure", "offset")
+    learned = ("falloff", "spread", "cosine", "response", "specular", "glare", "exposure", "offset")
     return replace(
         schedule,
         densify=schedule.densify.model_copy(update={"enabled": False}),

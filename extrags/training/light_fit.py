@@ -13,6 +13,7 @@ from torch import Tensor
 from extrags.config import LightConfig
 from extrags.illumination import NearFieldLight
 from extrags.raster.light import ROUGHNESS_MIN, ROW_LENGTH
+from extrags.training.frame_colors import FrameColorFit
 
 __all__ = [
     "BESIDE",
@@ -139,10 +140,13 @@ class LightFit:
     Args:
         light: where to start; it is copied.
         config: what is learned, and how fast.
+        colors: haze and balance of single frames, if they are learned; they are stepped too.
     """
 
-    def __init__(self, light: NearFieldLight, config: LightConfig) -> None:
-        self._config = config
+    def __init__(
+        self, light: NearFieldLight, config: LightConfig, colors: FrameColorFit | None = None
+    ) -> None:
+        self._config, self._colors = config, colors
         self._reference_distance = light.reference_distance
         values = light.parameters()
         self._slots: dict[str, _Slots] = {}
@@ -202,20 +206,21 @@ class LightFit:
         # Whoever uses the row says so where it is not finite.
         with np.errstate(over="ignore"):
             np.exp(common, out=common, where=self._logarithms)
-        return row
+        return row if self._colors is None or frame is None else self._colors.applied(row, frame)
 
     @staticmethod
     def _mean(values: np.ndarray) -> float:
         return float(np.add.reduce(values, dtype=np.float64)) / len(values)
 
     def prior(self) -> float:
-        """Terms of the loss that hold the lamp at the lens, and log-exposures of real frames near zero."""
+        """Terms of the loss: the lamp at the lens, log-exposures and balances of real frames near zero."""
         term = 0.0
         if self._config.offset:
             term = self._config.offset_prior * float(lamp_distance(self._tensor[self._offset]))
         if self._frame is None:
             return term
         exposures = self._log_exposure
+        term += 0.0 if self._colors is None else self._colors.prior()
         return term + self._config.exposure_prior * float(exposures @ exposures) / len(exposures)
 
     def step(self, gradient: Float[np.ndarray, "17"], rate_share: float = 1.0) -> None:
@@ -225,6 +230,9 @@ class LightFit:
             gradient: of the loss without the priors, with respect to the last `row`.
             rate_share: of the settings' learning rates.
         """
+        if self._colors is not None and self._frame is not None:
+            gradient, own = self._colors.carried_back(gradient, self._row, self._frame)
+            self._colors.step(own, self._frame, rate_share)
         if self._any_free:
             self._adam.step(self.common_gradient(gradient), rate_share)
         if self._config.specular:

@@ -17,6 +17,7 @@ from extrags.illumination import NearFieldLight
 from extrags.scene import Scene
 from extrags.threads import one_torch_thread
 from extrags.training.footprint import APPLIED_EVERY, SmallestFootprint
+from extrags.training.frame_colors import FrameColors
 from extrags.training.frame_weights import FrameWeights
 from extrags.training.light_fit import drop_faint_glare
 from extrags.training.pose_refinement import PoseRefinement, RefinedPoses
@@ -44,12 +45,20 @@ class TrainingResult:
         refined: corrected poses of the training frames, where corrections were kept; the scene belongs to
             these.
         frame_weights: which training frames are blurred or have moved, where that was looked for.
+        colors: haze and white balance of the training frames, where some was found; the scene belongs to
+            frames without (`extrags.training.frame_colors.with_corrected_colors`).
     """
 
     scene: Scene
     history: list[dict[str, float]]
     refined: RefinedPoses | None = None
     frame_weights: FrameWeights | None = None
+    colors: FrameColors | None = None
+
+    @property
+    def corrects_frames(self) -> bool:
+        """Whether the scene belongs to other poses or colours than those of the frames that were given."""
+        return self.refined is not None or self.colors is not None
 
 
 def optimise(
@@ -106,6 +115,8 @@ def optimise(
             step.update(observation, iteration)
             if iteration == schedule.glare_decided_at and step.light is not None:
                 drop_faint_glare(step.light, schedule.light)
+            if iteration == schedule.colors_decided_at and step.colors is not None:
+                step.colors.decide()
             density.step(adam, observation.rendering, iteration)
             last = iteration == schedule.iterations - 1
             if footprint is not None and (last or (iteration + 1) % APPLIED_EVERY == 0):
@@ -128,7 +139,8 @@ def optimise(
         raise DivergedError(account, last_good)
     found = Scene(Gaussians(**adam.parameters), step.light).detached()
     refined = poses.refined() if poses is not None and poses.kept else None
-    return TrainingResult(found, history, refined)
+    colors = None if step.colors is None else step.colors.found()
+    return TrainingResult(found, history, refined, colors=colors)
 
 
 def _psnr(observation: Observation, view: View) -> float:

@@ -21,20 +21,33 @@ from extrags.sequence import EndoscopicSequence
 from extrags.threads import one_torch_thread
 from extrags.training.continuing import EarlierScene, continued_schedule, continued_start
 from extrags.training.footprint import SmallestFootprint
+from extrags.training.frame_colors import TRIAL_UPDATES as COLOR_UPDATES
+from extrags.training.frame_colors import FrameColors, with_corrected_colors
 from extrags.training.frame_weights import weighted_views
 from extrags.training.normal_term import NormalTerm
 from extrags.training.optimise import TrainingResult, optimise
-from extrags.training.pose_refinement import TRIAL_UPDATES, PoseRefinement
+from extrags.training.pose_refinement import TRIAL_UPDATES, PoseRefinement, with_refined_poses
 from extrags.training.schedule import Schedule
 from extrags.training.starting import median_depth, starting_gaussians, valid_pixels
 from extrags.training.views import epochs
 
-__all__ = ["coarse_schedule", "reconstruct", "refines_poses", "scene_extent", "smallest_footprint"]
+__all__ = [
+    "as_reconstructed",
+    "coarse_schedule",
+    "reconstruct",
+    "refines_poses",
+    "scene_extent",
+    "smallest_footprint",
+]
 
 logger = logging.getLogger(__name__)
 
 GLARE_TRIAL_SHARE = 0.4
 """Of the iterations, after which it is decided whether there is any: it is found early."""
+
+COLOR_TRIAL_SHARE = 0.15
+"""The same for haze and white balance of single frames, where that is enough for so many frames: later, the
+light has to find its way back."""
 
 
 @one_torch_thread()
@@ -69,8 +82,9 @@ def reconstruct(
         DivergedError: when the optimisation does not stay finite.
 
     Returns:
-        The scene; where poses were refined (`refines_poses`), `refined` holds those of `frames`, and the
-        scene belongs to them (`extrags.training.pose_refinement.with_refined_poses`). Frames that are
+        The scene; where poses were refined (`refines_poses`), `refined` holds those of `frames`, and where
+        single frames have haze or another white balance, `colors` holds these: the scene belongs to frames
+        that are corrected by both (`as_reconstructed`). Frames that are
         blurred or have moved are named in the log (`config.inconsistent_frames`).
 
     Source: the loss of 3DGS [ExtraGS, eq. 3] inside the mask, with inverse depth where it is known; see
@@ -102,8 +116,15 @@ def reconstruct(
     schedule = coarse_schedule(config, scene_extent(sequence, chosen), depth, stage)
     if earlier is not None:
         schedule = continued_schedule(schedule, earlier.iterations)
-    elif config.light.glare:
-        schedule = replace(schedule, glare_decided_at=int(GLARE_TRIAL_SHARE * schedule.iterations))
+    else:
+        glare_decided = int(GLARE_TRIAL_SHARE * schedule.iterations)
+        colors_decided = max(int(COLOR_TRIAL_SHARE * schedule.iterations), COLOR_UPDATES * len(chosen))
+        learned = config.light.frame_colors and config.train_on == "train"
+        schedule = replace(
+            schedule,
+            glare_decided_at=glare_decided,
+            colors_decided_at=colors_decided if learned and colors_decided <= glare_decided else None,
+        )
     if config.normal_weight > 0:
         points = start.gaussians.means.numpy()
         schedule = replace(schedule, normals=NormalTerm.at(points, config, schedule.iterations))
@@ -132,6 +153,8 @@ def reconstruct(
             sequence.name,
             " ".join(f"{value:.2f}" for value in light.log_glare.exp().tolist()),
         )
+    if result.colors is not None:
+        _tell_colors(sequence, chosen, result.colors)
     if result.refined is not None and tried:
         logger.warning(
             "%s: the poses of training frames do not agree with their images; they are corrected by %.2g "
@@ -144,6 +167,41 @@ def reconstruct(
         # Refined poses differ by far too little to change a side.
         result = replace(result, scene=with_facing(result.scene, [cameras]))
     return replace(result, frame_weights=weights)
+
+
+def _tell_colors(sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"], colors: FrameColors) -> None:
+    hazy = np.flatnonzero(colors.haze > 0)
+    if len(hazy):
+        logger.warning(
+            "%s: %d of %d training frames, %s first, show a veil, as of smoke or a fogged lens (black shows "
+            "as up to %.2f); it is taken away (coarse.light.frame_colors)",
+            sequence.name,
+            len(hazy),
+            len(frames),
+            sequence.frame_name(int(frames[hazy[0]])),
+            colors.haze.max(),
+        )
+    if colors.log_balance.any():
+        logger.warning(
+            "%s: white balance differs between training frames, by %.0f %% (root mean square); it is evened "
+            "out (coarse.light.frame_colors)",
+            sequence.name,
+            100 * np.sqrt(np.square(colors.log_balance).mean()),
+        )
+
+
+def as_reconstructed(sequence: EndoscopicSequence, result: TrainingResult) -> EndoscopicSequence:
+    """The sequence that a scene belongs to: with the poses and colours that `reconstruct` has corrected.
+
+    Args:
+        sequence: whose training frames were reconstructed.
+        result: what `reconstruct` returned.
+    """
+    if result.refined is not None:
+        sequence = with_refined_poses(sequence, result.refined.world_from_camera)
+    if result.colors is not None and result.scene.light is not None:
+        sequence = with_corrected_colors(sequence, result.colors, result.scene.light.to("cpu"))
+    return sequence
 
 
 def _start(

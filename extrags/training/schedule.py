@@ -43,6 +43,9 @@ class Schedule:
     """Of the iterations, the last ones, in which the light's rates fall to `LIGHT_COOLDOWN_FINAL`."""
     glare_decided_at: int | None = None
     """Iteration after which glare stays only where there is enough of it (`LightConfig.glare_kept_from`)."""
+    colors_decided_at: int | None = None
+    """Iteration after which haze and white balance of single frames stay only where there is enough of them;
+    None: they are not learned."""
     iterations_before: int = 0
     """Of earlier rounds of the same stage: its progress counts them."""
     iterations_after: int = 0

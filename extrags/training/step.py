@@ -21,6 +21,7 @@ from extrags.raster.direct import DirectStep, Target
 from extrags.raster.loss import depth_loss
 from extrags.scene import Scene
 from extrags.training.density import DensityStrategy
+from extrags.training.frame_colors import BALANCE_PRIOR, FrameColorFit, colored
 from extrags.training.light_fit import (
     BESIDE,
     LOG_ROUGHNESS_BOUNDS,
@@ -57,6 +58,8 @@ class TrainingStep(Protocol):
     """Holds the parameters of a scene while they are optimised."""
 
     adam: SelectiveAdam
+    colors: FrameColorFit | None
+    """Haze and balance of single frames, while they are learned."""
 
     @property
     def light(self) -> NearFieldLight | None:
@@ -104,6 +107,9 @@ class AutogradStep:
         self._schedule = schedule
         self.adam = SelectiveAdam(_leaves(scene.gaussians), schedule.learning_rates(0))
         self.light, self._light_adam = _trainable_light(scene.light, schedule)
+        self.colors = _learned_colors(scene, schedule)
+        self._colors_leaf: Tensor | None = None
+        self._frame: int | None = None
 
     def differentiate(
         self, view: View, iteration: int, density: DensityStrategy, viewmat: np.ndarray | None = None
@@ -111,15 +117,19 @@ class AutogradStep:
         """See `TrainingStep.differentiate`."""
         schedule = self._schedule
         scene = Scene(Gaussians(**self.adam.parameters), self.light)
-        exposure = None
+        light = None
+        self._frame = view.frame
         if scene.light is not None:
-            exposure = scene.light.exposure(view.frame)[None]
+            light = scene.light.camera_light(scene.light.exposure(view.frame)[None])
+        if light is not None and self.colors is not None and view.frame is not None:
+            self._colors_leaf = self.colors.leaf()
+            light = colored(light, self._colors_leaf.to(scene.device), view.frame)
         pose = None
         if viewmat is not None:
             pose = scene.array(viewmat).requires_grad_()
         rendering = scene.render(
             view.camera,
-            exposure=exposure,
+            camera_light=light,
             sh_degree=schedule.sh_degree_at(iteration, scene.gaussians.sh_degree),
             viewmats=None if pose is None else pose[None],
             absgrad=density.needs_absgrad,
@@ -149,6 +159,8 @@ class AutogradStep:
         loss = loss * view.loss_weight
         if scene.light is not None and view.frame is not None:
             loss = loss + schedule.light.exposure_prior * scene.light.log_exposure.square().mean()
+            if self._colors_leaf is not None:
+                loss = loss + BALANCE_PRIOR * self._colors_leaf[:, 1:].square().mean()
         if scene.light is not None and schedule.light.offset:
             loss = loss + schedule.light.offset_prior * lamp_distance(scene.light.offset)
         for penalty in _penalties(schedule, self.adam.parameters, density, iteration):
@@ -161,6 +173,10 @@ class AutogradStep:
         """See `TrainingStep.update`."""
         self.adam.step(visible=observation.visible)
         self.adam.zero_grad()
+        leaf, self._colors_leaf = self._colors_leaf, None
+        if self.colors is not None and leaf is not None and leaf.grad is not None and self._frame is not None:
+            share = self._schedule.light_rate_share(iteration)
+            self.colors.step(leaf.grad.numpy(), self._frame, share)
         if self._light_adam is not None:
             share = self._schedule.light_rate_share(iteration)
             for group in self._light_adam.param_groups:
@@ -186,7 +202,8 @@ class NativeStep:
         self._near = scene.near
         self._schedule = schedule
         self._sh_degree = scene.gaussians.sh_degree
-        self.light_fit = None if scene.light is None else LightFit(scene.light, schedule.light)
+        self.colors = _learned_colors(scene, schedule)
+        self.light_fit = None if scene.light is None else LightFit(scene.light, schedule.light, self.colors)
         self.adam = SelectiveAdam(
             _leaves(scene.gaussians), schedule.learning_rates(0), joined={"sh": ("sh0", "shN")}
         )
@@ -273,6 +290,12 @@ class NativeStep:
             depth_confidence=view.depth_confidence,
             shown=view.shown,
         )
+
+
+def _learned_colors(scene: Scene, schedule: Schedule) -> FrameColorFit | None:
+    if scene.light is None or schedule.colors_decided_at is None:
+        return None
+    return FrameColorFit(len(scene.light.log_exposure))
 
 
 def _penalties(

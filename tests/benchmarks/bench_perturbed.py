@@ -30,8 +30,7 @@ from extrags.evaluation import evaluate
 from extrags.in_memory_pipeline import run_pipeline
 from extrags.reading_corrections import with_corrections
 from extrags.sequence import EndoscopicSequence
-from extrags.training import reconstruct
-from extrags.training.pose_refinement import with_refined_poses
+from extrags.training import as_reconstructed, reconstruct
 from extrags.training.starting import median_depth
 from tests.benchmarks.wrong_recordings import OTHERWISE_RECORDED, WRONG
 
@@ -89,12 +88,11 @@ def measured(sequence: EndoscopicSequence, config: PipelineConfig, *, whole: boo
         run = run_pipeline(sequence, config, until="evaluate")
         return {scene: figures(found.metrics) for scene, found in run.evaluations.items()}
     found = reconstruct(sequence, config.coarse)
-    moved = found.refined is not None
-    if found.refined is not None:
-        sequence = with_refined_poses(sequence, found.refined.world_from_camera)
+    sequence = as_reconstructed(sequence, found)
     case: dict[str, Any] = {
         "coarse": figures(evaluate(found.scene, sequence).metrics),
-        "poses_corrected": moved,
+        "poses_corrected": found.refined is not None,
+        "colors_corrected": found.colors is not None,
     }
     if found.scene.light is not None:
         case["glare"] = [round(value, 3) for value in found.scene.light.log_glare.exp().tolist()]
@@ -108,8 +106,7 @@ def of_wrong(frames: EndoscopicSequence, right: EndoscopicSequence, config: Pipe
         training = with_training_depth(training, estimate_depth(training, config.depth, config.poses))
     found = reconstruct(training, config.coarse)
     frames = replace(frames, rgb=right.rgb, depth_mm=right.depth_mm, depth_error=None, withheld_depth_mm=None)
-    if found.refined is not None:
-        frames = with_refined_poses(frames, found.refined.world_from_camera)
+    frames = as_reconstructed(frames, found)
     return {"coarse": figures(evaluate(found.scene, frames).metrics), "train": len(training)}
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import extrags.training
 from extrags.config import CoarseConfig, IngestConfig, PosesConfig
 from extrags.errors import ConfigError
 from extrags.events import Event, Progress, subscribed
@@ -16,6 +17,7 @@ from extrags.observed_surface import observed_from_depth
 from extrags.poses import observed_by_those_left
 from extrags.sequence import EndoscopicSequence
 from extrags.store import Ref, Slot, Store
+from extrags.training.frame_colors import FrameColors
 from extrags.zarr_io import group_exists
 from tasks.coarse import coarse, refined_frames
 from tasks.ingest import training_frames
@@ -181,6 +183,25 @@ def test_refined_poses_are_kept_and_held_out_frames_go_along(store: str, posed: 
     assert kept.world_from_camera is not None
     moved = np.linalg.norm((held_out.world_from_camera - kept.world_from_camera)[kept.test, :3, 3], axis=1)
     assert 0 < moved.max() < shift.max()
+
+
+def test_frames_whose_colors_were_corrected_are_kept(
+    store: str, posed: Ref, training: Ref, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reconstruct = extrags.training.reconstruct
+    count = len(read(store, training))
+    colors = FrameColors(np.full(count, 0.2), np.zeros((count, 3)))
+    monkeypatch.setattr(
+        "extrags.training.reconstruct",
+        lambda *given, **named: replace(reconstruct(*given, **named), colors=colors),
+    )
+    done = coarse.fn(store=store, sequence=training, config=CoarseConfig(iterations=2, max_points=50))
+    assert Store(store).manifest(done).counts["corrected_colors"] == 1
+    whole = refined_frames.fn(store=store, sequence=posed, coarse=done)
+    before, after = read(store, posed), read(store, whole)
+    assert after.pose_source == before.pose_source
+    changed = [bool((a != b).any()) for a, b in zip(after.rgb, before.rgb, strict=True)]
+    assert np.flatnonzero(changed).tolist() == before.train.tolist()
 
 
 def test_given_poses_are_left_alone(store: str) -> None:

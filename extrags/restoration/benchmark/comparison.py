@@ -34,8 +34,7 @@ from extrags.restoration.refinement.weights import bundled_refiner
 from extrags.restoration.training_data.pairs import make_pairs
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
-from extrags.training import reconstruct
-from extrags.training.pose_refinement import with_refined_poses
+from extrags.training import as_reconstructed, reconstruct
 from extrags.view_synthesis.gather import gather_references
 from extrags.view_synthesis.references import ReferenceViews
 
@@ -230,11 +229,9 @@ def prepared(
 
 
 def coarse_scene(sequence: EndoscopicSequence, config: CoarseConfig) -> tuple[Scene, EndoscopicSequence]:
-    """The coarse scene of a sequence, and the sequence with the poses that the scene belongs to."""
+    """The coarse scene of a sequence, and the sequence as the scene belongs to it."""
     result = reconstruct(sequence.training_part(), config)
-    if result.refined is not None:
-        sequence = with_refined_poses(sequence, result.refined.world_from_camera)
-    return result.scene, sequence
+    return result.scene, as_reconstructed(sequence, result)
 
 
 def compare_methods(

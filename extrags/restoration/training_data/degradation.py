@@ -102,7 +102,8 @@ class Degradation:
                 "refine_poses": False,
                 "max_points": round(self.gaussians_share * coarse.max_points),
                 "densify": coarse.densify.model_copy(update=densify),
-                "light": coarse.light.model_copy(update={"enabled": self.light}),
+                # And so do colours.
+                "light": coarse.light.model_copy(update={"enabled": self.light, "frame_colors": False}),
                 "seed": seed,
             }
         )
