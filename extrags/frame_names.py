@@ -125,7 +125,7 @@ class NameOrder:
       front that others lack (`0.05` beside `0.1`) speaks for decimals, as counts are padded alike or not.
     - Else that reading holds in which the numbers are evenly spaced, of two the one without a gap. Where
       all fractions have as many digits, decimals run on from one whole number to the next, and counts
-      begin anew.
+      begin anew: so they are decimals where some run on, in spite of pauses between others.
     - Of many uneven fractions of which none ends in 0, zeros were dropped: decimals.
 
     What is then undecided is read as counts. It is `doubtful` where that makes another order.
@@ -276,7 +276,10 @@ def _judged(items: Sequence[_Parted], place: int) -> _Reading | None:
     even = _is_even(steps) and not begins_anew
     even_counts = _is_even(counted)
     if even != even_counts:
-        return "decimals" if even else "counts"
+        # Pauses of a recorder are gaps between decimals, and mostly begin and end at another whole number.
+        usual_count = usual_step(counted)
+        runs_on = not varies and any(not is_gap(step, usual_count) for step in onward)
+        return "decimals" if even or runs_on else "counts"
     if even and not varies:
         return "decimals" if onward else None
     if even:

@@ -94,6 +94,17 @@ def test_counts_stay_counts(names: list[str]) -> None:
     assert order_for_fingerprint(names) == {}
 
 
+def test_times_with_pauses_are_decimals() -> None:
+    """Five gaps in 46 frames were too many for even steps, and the frames were told to be several series."""
+    paused = [0.0] * 20 + [3.0] * 15 + [13.0] * 15
+    times = [1700000000 + k / 10 + paused[k] for k in range(50) if k not in (10, 11, 24, 30)]
+    names = [f"{time:.6f}" for time in times]
+    order = NameOrder(names)
+    assert [order.number(name) for name in names] == [Decimal(name) for name in names]
+    pairs = [f"{series}.{k:02d}.png" for series in range(1, 9) for k in (1, 2)]
+    assert [NameOrder(pairs).number(name) for name in pairs] == [Decimal(1), Decimal(2)] * 8
+
+
 def test_hexadecimal_numbers_have_their_place() -> None:
     """0a to 0f were read before 04, as numbers without digits before them."""
     names = named(20, lambda k: f"{k + 4:02x}")
