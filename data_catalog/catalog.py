@@ -165,7 +165,8 @@ def read(source: Source | str | Path, config: IngestConfig | None = None) -> End
     sequence = dataset.read(source, config if detail is None else detail.applied_to(config))
     reader = find_reader(source.format)
     stored = OPENCV if reader is None else reader.poses
-    check_sequence(sequence, file=source.path or source.name, stored=stored)
+    depth_unit = "" if reader is None else reader.depth_unit
+    check_sequence(sequence, file=source.path or source.name, stored=stored, depth_unit=depth_unit)
     if config.scale_mm_per_unit is not None:
         sequence = _scaled(sequence, config.scale_mm_per_unit)
     # After the checks, which hold poses against all depth there is; what was observed is known by now.

@@ -43,6 +43,11 @@ _CLEARLY_BETTER = 0.35
 # catalogue it is off by 4 to 5 %, and by 0.2 % once it is divided by the length of the ray.
 _RAY_SUSPICIOUS_ERROR = 0.02
 _CLEARLY_ALONG_RAY = 0.25
+# Depth that is a thousand times too far is off by 2 % beside steps of 7 % of the distance, and by a tenth of
+# that once it is divided.
+_FAR_SUSPICIOUS_ERROR = 0.005
+_FAR_FACTOR = 0.2
+_FAR_BETTER = 0.25
 # A pair of views whose points mostly leave the image tells nothing.
 _MIN_INSIDE_SHARE = 0.15
 # Nor does depth of hardly any pixels (share of the image).
@@ -54,6 +59,7 @@ _CHECKED_PAIRS = 6
 _CHECKED_POINTS = 400
 # Factors by which depth may be off: a tenth of a thousandth to ten thousand, in steps of 5 %.
 _DEPTH_FACTORS = np.exp(np.arange(-190, 191) * 0.05)
+_FINE_STEPS = np.exp(np.arange(-10, 11) * 0.005)
 _CLEARLY_OTHER_FACTOR = 1.5
 _KNOWN_FACTORS = {
     1000.0: "depth in metres beside poses in millimetres",
@@ -68,7 +74,11 @@ _KNOWN_FACTORS = {
 
 
 def check_sequence(
-    sequence: EndoscopicSequence, *, file: object = None, stored: PoseConvention = OPENCV
+    sequence: EndoscopicSequence,
+    *,
+    file: object = None,
+    stored: PoseConvention = OPENCV,
+    depth_unit: str = "",
 ) -> None:
     """Refuse a sequence that no stage could use.
 
@@ -76,6 +86,7 @@ def check_sequence(
         sequence: what a reader made.
         file: named in errors.
         stored: how the file should hold poses, for errors about them.
+        depth_unit: in which unit files of the layout hold depth, for errors about it.
 
     Raises:
         PoseError: a pose that is not a rigid motion, or axes or positions that the depth contradicts.
@@ -87,7 +98,7 @@ def check_sequence(
     if sequence.depth_mm is not None and not any((depth > 0).any() for depth in sequence.depth_mm):
         raise SourceError("no pixel of any frame has a depth", file=file, field="depth_mm")
     check_axes(sequence, file=file, stored=stored)
-    check_depth_scale(sequence, file=file)
+    check_depth_scale(sequence, file=file, depth_unit=depth_unit)
 
 
 def check_axes(sequence: EndoscopicSequence, *, file: object = None, stored: PoseConvention = OPENCV) -> None:
@@ -135,7 +146,7 @@ def check_axes(sequence: EndoscopicSequence, *, file: object = None, stored: Pos
         )
 
 
-def check_depth_scale(sequence: EndoscopicSequence, *, file: object = None) -> None:
+def check_depth_scale(sequence: EndoscopicSequence, *, file: object = None, depth_unit: str = "") -> None:
     """Refuse depth in another unit than the poses, but not depth along the ray.
 
     Depth carried from frame to frame meets the next frame's depth only when both have one unit. Where it does
@@ -143,6 +154,15 @@ def check_depth_scale(sequence: EndoscopicSequence, *, file: object = None) -> N
     nothing, and where cameras move little any large factor fits as well as no motion: that is no unit.
     Where it meets it at least four times better once it is divided by the length of each pixel's ray, it is
     in the unit of the poses.
+
+    Depth that is far too large hardly contradicts cameras that move little from frame to frame, as nothing
+    comes nearer: there the error decides less than how much better another factor fits.
+
+    Args:
+        sequence: what a reader made.
+        file: named in errors.
+        depth_unit: in which unit files of the layout hold depth, as a clause; empty where it is that of the
+            poses as it stands there.
 
     Raises:
         SourceError: another factor, at least 1.5 times more or less, fits much better; or K is that of an
@@ -160,10 +180,10 @@ def check_depth_scale(sequence: EndoscopicSequence, *, file: object = None) -> N
     as_given = _reprojection_error(sequence, poses, pairs, seen)
     if as_given > _RAY_SUSPICIOUS_ERROR and _is_along_ray(sequence, poses, pairs):
         return
-    if as_given < _SUSPICIOUS_ERROR:
+    if as_given < _FAR_SUSPICIOUS_ERROR:
         return
-
-    _refuse_intrinsics_of_another_size(sequence, as_given, file)
+    if as_given >= _SUSPICIOUS_ERROR:
+        _refuse_intrinsics_of_another_size(sequence, as_given, file)
 
     def error_with(factor: float) -> float:
         # Depth times a factor beside these poses is this depth beside poses that move by less.
@@ -176,10 +196,15 @@ def check_depth_scale(sequence: EndoscopicSequence, *, file: object = None) -> N
     clearly_other = max(factor, 1 / factor) >= _CLEARLY_OTHER_FACTOR
     if not clearly_other or best >= min(_CLEARLY_BETTER * as_given, _CONVINCING_ERROR):
         return
+    if as_given < _SUSPICIOUS_ERROR and (factor > _FAR_FACTOR or best >= _FAR_BETTER * as_given):
+        return
     if _is_proven_outside(sequence, pairs, file):
         return
+    factor = min((factor * fine for fine in _FINE_STEPS), key=error_with)
+    about = f"{float(f'{factor:.3g}'):g}"
     nearest = min(_KNOWN_FACTORS, key=lambda known: abs(np.log(known / factor)))
-    hint = f", as of {_KNOWN_FACTORS[nearest]}" if abs(np.log(nearest / factor)) < 0.2 else ""
+    known = abs(np.log(nearest / factor)) < 0.2 and not depth_unit
+    hint = f", as of {_KNOWN_FACTORS[nearest]}" if known else ""
     still = error_with(np.inf)
     if best >= _CLEARLY_BETTER * still and still < min(_CLEARLY_BETTER * as_given, _CONVINCING_ERROR):
         if not _are_wide(sequence, pairs):
@@ -187,7 +212,7 @@ def check_depth_scale(sequence: EndoscopicSequence, *, file: object = None) -> N
         raise PoseError(
             f"the positions of the cameras contradict the depth: carried from frame to frame it is off by "
             f"{as_given:.0%} (median), but only by {still:.1%} if the cameras did not move at all (by "
-            f"{best:.1%} when it is multiplied by about {factor:.3g}{hint}, which so little motion cannot "
+            f"{best:.1%} when it is multiplied by about {about}{hint}, which so little motion cannot "
             "tell). "
             "Expected positions of cameras in the world, in the unit of the depth",
             file=file,
@@ -196,7 +221,7 @@ def check_depth_scale(sequence: EndoscopicSequence, *, file: object = None) -> N
     raise SourceError(
         f"depth and poses are in different units: carried from frame to frame depth is off by "
         f"{as_given:.0%} (median), but only by {best:.1%} when it is multiplied by about "
-        f"{factor:.3g}{hint}. Expected depth in the unit of the poses",
+        f"{about}{hint}. Expected depth in the unit of the poses{depth_unit and f': {depth_unit}'}",
         file=file,
         field="depth_mm",
     )

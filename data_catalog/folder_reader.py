@@ -118,6 +118,8 @@ class FolderReader:
             file, frame and field.
         conventions: axes and units on disk, in one line.
         poses: how files of this layout hold poses, in whose words wrong ones are told.
+        depth_unit: in which unit files of this layout hold depth, as a clause for errors about it; empty
+            where that is the unit of the poses as they stand there.
         notes: what reading has to find out about this folder, as sentences; raises what `frames` raises.
         named_sets: sequences of the catalogue in this layout, each a folder below a data root.
         known_name: the catalogue's name for a folder, where it has one; None goes by `named_sets`.
@@ -137,6 +139,7 @@ class FolderReader:
     frames: Callable[[Path, IngestConfig], SourceFrames]
     conventions: str = ""
     poses: PoseConvention = OPENCV
+    depth_unit: str = ""
     notes: Callable[[Path], tuple[str, ...]] | None = None
     named_sets: tuple[Descriptor, ...] = ()
     known_name: Callable[[Path], str | None] | None = None

@@ -12,7 +12,14 @@ import numpy as np
 from data_catalog.inside import inside
 from extrags.errors import SourceError, SourceNotFoundError
 
-__all__ = ["DEPTH_FILE_KEYS", "DEPTH_KEYS", "NERFSTUDIO_DEPTH_SCALE", "depth_factor", "depth_files"]
+__all__ = [
+    "DEPTH_FILE_KEYS",
+    "DEPTH_KEYS",
+    "DEPTH_UNIT",
+    "NERFSTUDIO_DEPTH_SCALE",
+    "depth_factor",
+    "depth_files",
+]
 
 logger = logging.getLogger(__name__)
 
@@ -23,6 +30,11 @@ DEPTH_FILE_KEYS = (_OF_NERFSTUDIO, _OF_INSTANT_NGP)
 _UNIT, _INTEGER_SCALE, _SWITCH = "depth_unit_scale_factor", "integer_depth_scale", "enable_depth_loading"
 DEPTH_KEYS = (_UNIT, _INTEGER_SCALE, _SWITCH)
 """What is stated of the depth of all frames."""
+
+DEPTH_UNIT = (
+    f"what files hold is multiplied by {_UNIT}, which is {NERFSTUDIO_DEPTH_SCALE:g} where the file does not "
+    "state it (1 would leave it as it is)"
+)
 
 
 def depth_files(

@@ -55,6 +55,7 @@ from data_catalog.readers.sparse_points import read_ply_points, write_ply_points
 from data_catalog.readers.transforms_depth import (
     DEPTH_FILE_KEYS,
     DEPTH_KEYS,
+    DEPTH_UNIT,
     NERFSTUDIO_DEPTH_SCALE,
     depth_factor,
     depth_files,
@@ -198,6 +199,7 @@ READER = FolderReader(
     "depth in thousandths of the pose unit unless it says otherwise",
     chosen=_chosen,
     poses=OPENGL,
+    depth_unit=DEPTH_UNIT,
 )
 
 

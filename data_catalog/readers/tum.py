@@ -143,6 +143,7 @@ READER = FolderReader(
     files=_files,
     frames=_frames,
     conventions="OpenCV camera axes, camera to world, m; depth 5000 to a metre; mm on reading",
+    depth_unit="in this layout a level of a depth file is 1/5000 m",
 )
 
 

@@ -372,7 +372,7 @@ DAMAGES = {
     "depth without its factor": Damage(
         "transforms",
         edited("transforms.json", lambda content: content.update(depth_unit_scale_factor=1.0)),
-        "depth and poses are in different units.*as of depth in millimetres beside poses in metres",
+        "depth and poses are in different units.*is multiplied by depth_unit_scale_factor, which is 0.001",
         None,
         "depth_mm",
     ),

@@ -323,6 +323,12 @@ class TestDepthScale:
         told = float(caught.value.problem.split("multiplied by about ")[1].split()[0].rstrip(",."))
         assert told == pytest.approx(factor, rel=0.06)
 
+    def test_the_unit_of_a_layout_takes_the_place_of_a_guess(self, clip) -> None:
+        other = replace(clip, depth_mm=(clip.depth_mm / 1000).astype(np.float32))
+        told = r"about \d+\. Expected depth in the unit of the poses: a level is 1/5000 m$"
+        with pytest.raises(SourceError, match=told):
+            check_depth_scale(other, depth_unit="a level is 1/5000 m")
+
     def test_small_errors_are_let_pass(self, clip, distanced) -> None:
         check_depth_scale(replace(clip, depth_mm=(clip.depth_mm * 1.05).astype(np.float32)))
         check_sequence(distanced)
@@ -356,6 +362,18 @@ class TestDepthScale:
         depth = (clip.depth_mm / 1000).astype(np.float32)
         with pytest.raises((SourceError, PoseError), match=r"different units|positions of the cameras"):
             check_depth_scale(replace(clip, world_from_camera=calm, depth_mm=depth))
+
+    @pytest.mark.parametrize("step", [0.4, 0.8])
+    def test_depth_far_too_large_is_refused_beside_small_steps(self, clip, step) -> None:
+        """A thousand times as far, nothing comes nearer in a step: depth is off by 1 or 2 % alone."""
+        straight = np.repeat(np.eye(4)[None], len(clip), axis=0)
+        straight[:, 2, 3] = step * np.arange(len(clip))
+        wall = (40 - straight[:, 2, 3])[:, None, None] * np.ones_like(clip.depth_mm)
+        towards = replace(clip, world_from_camera=straight, depth_mm=wall)
+        check_depth_scale(towards)
+        told = r"multiplied by about 0\.00\d+, as of depth in millimetres beside poses in metres"
+        with pytest.raises(SourceError, match=told):
+            check_depth_scale(replace(towards, depth_mm=1000 * wall))
 
     def test_no_parallax_no_verdict(self, clip) -> None:
         still = np.repeat(clip.world_from_camera[:1], len(clip), axis=0)
