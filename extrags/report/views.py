@@ -121,12 +121,15 @@ def virtual_rows(
     """
     total = len(pseudo.rendered)
     rows = []
+    masked = False
     chosen = [int(index) for index in evenly_spaced(total, views)]
     errors = pseudo.expected_error
     high = 0.0 if errors is None else scale_end([np.asarray(errors[chosen], dtype=np.float64)])
     for index in chosen:
         u = np.asarray(pseudo.uncertainty[index], dtype=np.float64)
         reference = int(sequence.train[int(pseudo.reference[index])])
+        # What is burnt in outside the picture, as a patient's name, has no place on a page.
+        masked = masked or not bool(sequence.mask[reference].all())
         clip = int(pseudo.clip[index])
         where = f"virtual view {index + 1}"
         before, after = as_uint8(pseudo.rendered[index]), as_uint8(pseudo.target[index])
@@ -136,7 +139,7 @@ def virtual_rows(
         cells = [
             image_cell(
                 sequence.rgb[reference],
-                None,
+                sequence.mask[reference],
                 "Reference",
                 f"Reference frame {name}",
                 largest_bytes,
@@ -168,7 +171,7 @@ def virtual_rows(
     scales = [ColorScale(color_bar(UNCERTAINTY_COLORMAP), "0 known", "1 unknown", "uncertainty u")]
     if errors is not None:
         scales.append(error_scale(high, "error the restorer expects of its own colours"))
-    return ImageTable(tuple(rows), tuple(scales), len(rows), total)
+    return ImageTable(tuple(rows), tuple(scales), len(rows), total, masked=masked)
 
 
 def _renders(inputs: ReportInputs) -> list[tuple[str, RendersLike]]:

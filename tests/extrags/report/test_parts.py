@@ -15,6 +15,7 @@ from extrags.report.charts import drawing_style, history_chart, views_chart
 from extrags.report.encode import as_uint8, color_mapped, fitted_image, outlined, png_image
 from extrags.report.image_table import evenly_spaced
 from extrags.report.space import occupancy_slices, scene_views, trajectory_colors
+from extrags.report.views import virtual_rows
 from extrags.report.wording import compare, duration, number
 
 from .conftest import metrics_of
@@ -274,3 +275,17 @@ def test_a_mean_says_of_how_many_it_is() -> None:
 
     text = Page(build_dataset_report([covered("a", 0.8, 1.0), covered("b", 1.0, 0.8)])).text
     assert "−0.020 better" not in text  # noqa: RUF001
+
+
+def test_what_is_written_beside_the_picture_is_on_no_page(inputs: ReportInputs) -> None:
+    """Reference frames were shown as recorded, with the name of the patient in their dark surround."""
+    assert inputs.pseudo is not None
+    rgb, mask = inputs.sequence.rgb.copy(), inputs.sequence.mask.copy()
+    rgb[:, :8], mask[:, :8] = 255, False
+    table = virtual_rows(inputs.pseudo, replace(inputs.sequence, rgb=rgb, mask=mask), 2, 10**6)
+    shown = decoded(table.rows[1].cells[0].image.uri)
+    assert not isinstance(shown, str)
+    assert np.ptp(np.asarray(shown.convert("RGB"))[:6].reshape(-1, 3).astype(int), axis=0).max() < 4
+    assert np.asarray(shown)[:6].max() < 250
+    assert table.masked
+    assert not virtual_rows(inputs.pseudo, inputs.sequence, 2, 10**6).masked
