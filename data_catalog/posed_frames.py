@@ -53,6 +53,7 @@ logger = logging.getLogger(__name__)
 _EXACT_POSE = 1e-14
 _BRIGHTEST_OF_12_BITS = 16
 """Of 255: values of 12 bits in files of 16 stay below."""
+_BRIGHTEST_OF_10_BITS = 4
 _BITS_OF_LARGE_VALUES = 16
 _LOOKED_AT_FOR_ALPHA = 8
 """Frames, spread over the source: their alpha is decoded apart from their colours."""
@@ -342,9 +343,11 @@ class _Pixels:
             SourceError: when nothing is brighter than what 12 bits reach in files of 16.
         """
         if self.brightest < _BRIGHTEST_OF_12_BITS:
+            bits = 10 if 0 < self.brightest < _BRIGHTEST_OF_10_BITS else 12
+            factor = 2 ** (_BITS_OF_LARGE_VALUES - bits)
             likely = (
-                "expected pictures that use the whole range. Grey of 12 bits in files of 16 looks like that: "
-                "multiply it by 16, so that 4095 becomes 65520"
+                f"expected pictures that use the whole range. Those of {bits} bits in files of 16 look like "
+                f"that: multiply them by {factor}, so that {2**bits - 1} becomes {(2**bits - 1) * factor}"
                 if bits_per_value(frames[0].file) == _BITS_OF_LARGE_VALUES
                 else "all frames are black"
             )

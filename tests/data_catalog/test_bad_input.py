@@ -159,14 +159,21 @@ class TestFolder:
         for file in sorted((posed_folder / "rgb").iterdir()):
             grey = np.asarray(Image.open(file).convert("L")).astype(np.uint16)
             Image.fromarray(grey * 16).save(file)
-        with pytest.raises(SourceError, match=r"field rgb: .* brighter than 1\d of 255: .* Grey of 12 bits"):
+        with pytest.raises(SourceError, match=r"field rgb: .* brighter than 1\d of 255: .* of 12 bits"):
             read(posed_folder)
 
-    def test_colours_of_12_bits_in_16(self, posed_folder) -> None:
+    @pytest.mark.parametrize(
+        ("factor", "told"),
+        [
+            (16, r"1\d of 255: .* of 12 bits in files of 16 .* by 16, so that 4095 becomes 65520"),
+            (4, r"[23] of 255: .* of 10 bits in files of 16 .* by 64, so that 1023 becomes 65472"),
+        ],
+    )
+    def test_colours_of_fewer_bits_in_16(self, posed_folder, factor, told) -> None:
         """Pillow calls them colours of 8 bits."""
         for file in sorted((posed_folder / "rgb").iterdir()):
-            assert cv2.imwrite(str(file), cv2.imread(str(file)).astype(np.uint16) * 16)
-        with pytest.raises(SourceError, match=r"brighter than 1\d of 255: .* Grey of 12 bits"):
+            assert cv2.imwrite(str(file), cv2.imread(str(file)).astype(np.uint16) * factor)
+        with pytest.raises(SourceError, match=f"brighter than {told}"):
             read(posed_folder)
 
     def test_black_pictures_of_8_bits(self, posed_folder) -> None:
