@@ -32,6 +32,10 @@ a focal length that is off by 5 % 0.002; smooth errors of 2 % 0.0085 to 0.009 (d
 EXACT = 0.003
 """Error of depth that is not looked into any further."""
 
+GROSS_ERROR = 0.1
+"""From which on poses that are grossly wrong are as likely: the motion that fits a pair of frames best takes
+as large a share of smooth errors of depth as of theirs."""
+
 FITTED_PAIRS = 40
 """Pairs at most whose motion is fitted."""
 
@@ -100,14 +104,24 @@ def with_depth_error(
     if found is None or found.beyond_motion < LEAST_ERROR:
         return sequence
     _log.warning(
-        "%s: training frames disagree about their depth by %.1f %% (median), as if each were off by %.1f %% "
-        "in its own way; it is corrected by what is estimated from the images (ingest.depth_error)",
+        "%s: training frames disagree about their depth by %.1f %% (median), %s; depth is corrected by what "
+        "is estimated from the images (ingest.depth_error)",
         sequence.name,
         100 * MEDIAN * found.error,
-        100 * found.error,
+        _in_words(found.error),
         extra={"topic": "depth and poses", "field": "depth_mm"},
     )
     return _uncertain(sequence, found.of_frame)
+
+
+def _in_words(error: float) -> str:
+    own = f"as if each were off by {100 * error:.1f} % in its own way"
+    if error < GROSS_ERROR:
+        return own
+    return (
+        f"{own}, or as if poses were wrong (are frames and poses in the same order, and is w of quaternions "
+        "in its place?)"
+    )
 
 
 def as_given(sequence: EndoscopicSequence) -> EndoscopicSequence:

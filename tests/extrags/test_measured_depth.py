@@ -89,6 +89,7 @@ def test_smooth_errors_are_found_and_measured(
     assert refines_poses(given.training_part(), extrags.PROFILES["balanced"].coarse)
     assert not refines_poses(found.training_part(), extrags.PROFILES["balanced"].coarse)
     assert "training frames disagree about their depth" in caplog.text
+    assert "in its own way; depth is corrected" in caplog.text
     assert with_depth_error(found) is found
     undone = as_given(found)
     assert undone.depth_error is undone.withheld_depth_mm is None
@@ -112,6 +113,17 @@ def test_poses_that_are_off_are_no_error_of_depth(exact: EndoscopicSequence, fac
     assert found is not None
     assert found.beyond_motion < 0.2 * found.error
     assert with_depth_error(moved) is moved
+
+
+def test_poses_that_may_be_grossly_wrong_are_told(
+    exact: EndoscopicSequence, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Quaternions whose w was read as x went on as depth that is off by a fifth, without a word of poses."""
+    poses = exact.cameras.world_from_camera.copy()
+    quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+    poses[:, :3, :3] = Rotation.from_quat(quaternions[:, [3, 0, 1, 2]]).as_matrix()
+    with_depth_error(replace(exact, world_from_camera=poses))
+    assert "or as if poses were wrong (are frames and poses in the same order" in caplog.text
 
 
 def test_a_number_is_taken_for_it(exact: EndoscopicSequence) -> None:
