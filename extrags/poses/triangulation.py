@@ -19,6 +19,14 @@ from extrags.sequence import EndoscopicSequence
 __all__ = ["Triangulation", "triangulate_points"]
 
 MIN_TRAINING_FRAMES = 2
+FEWEST_MATCHES = 200
+"""Fewer tell nothing of the poses."""
+CONTRADICTED_SHARE = 0.5
+"""Of matches that agree with poses, below which these are wrong if what is left is far off as well. Right
+poses keep 0.65 (frames far from one another, where many matches are false) to 0.98, poses in other axes or
+inverted 0.3 to 0.41: in a small image many lines pass within 2 px of a point."""
+CONTRADICTED_PX = 0.8
+"""Median distance of projections from observations: of right poses 0.16 to 0.53, of wrong ones 1.1 to 1.4."""
 _LOG = logging.getLogger(__name__)
 
 
@@ -96,7 +104,9 @@ def triangulate_points(
     module, seen = "extrags.poses.colmap_triangulation", sequence.at_most_width(config.max_width)
     result = run_job(module, _job(seen, config), sequence.name, stage=stage)
     larger = np.array([sequence.width / seen.width, sequence.height / seen.height])
-    return _assessed(sequence, replace(result, observed_px=result.observed_px * larger))
+    found = _assessed(sequence, replace(result, observed_px=result.observed_px * larger))
+    _tell_of_wrong_poses(sequence.name, found, float(larger[0]))
+    return found
 
 
 def _job(sequence: EndoscopicSequence, config: PosesConfig) -> PoseJob:
@@ -140,6 +150,29 @@ def _assessed(sequence: EndoscopicSequence, result: PoseJobResult) -> Triangulat
     )
     _LOG.info("%s: %s", sequence.name, found.summary)
     return found
+
+
+def _tell_of_wrong_poses(name: str, found: Triangulation, larger: float) -> None:
+    """Warn where features say that poses are wrong, and not only inexact.
+
+    Args:
+        name: of the sequence.
+        found: what its poses explain.
+        larger: how many times as wide its frames are as those in which features were looked for.
+    """
+    matches = found.report.get("matches", 0)
+    if matches < FEWEST_MATCHES or found.report["matches_kept"] >= CONTRADICTED_SHARE * matches:
+        return
+    if len(found) and np.median(found.reprojection_px) <= CONTRADICTED_PX * larger:
+        return
+    _LOG.warning(
+        "%s: the poses explain %.0f %% of %d feature matches between training frames: they are probably in "
+        "other axes, inverted or those of other frames, or K is wrong; `extrags data check` says which, "
+        "where frames tell",
+        name,
+        100 * found.report["matches_kept"] / matches,
+        matches,
+    )
 
 
 def _no_points(sequence: EndoscopicSequence) -> PoseJobResult:
