@@ -120,7 +120,7 @@ def _in_words(error: float) -> str:
         return own
     return (
         f"{own}, or as if poses were wrong (are frames and poses in the same order, and is w of quaternions "
-        "in its place?)"
+        "in its place?) or depth inverse"
     )
 
 

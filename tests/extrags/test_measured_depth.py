@@ -124,6 +124,7 @@ def test_poses_that_may_be_grossly_wrong_are_told(
     poses[:, :3, :3] = Rotation.from_quat(quaternions[:, [3, 0, 1, 2]]).as_matrix()
     with_depth_error(replace(exact, world_from_camera=poses))
     assert "or as if poses were wrong (are frames and poses in the same order" in caplog.text
+    assert "or depth inverse; depth is corrected" in caplog.text
 
 
 def test_a_number_is_taken_for_it(exact: EndoscopicSequence) -> None:
