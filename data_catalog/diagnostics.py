@@ -138,7 +138,8 @@ def _images(sequence: EndoscopicSequence) -> Iterator[Finding]:
     """Duplicates, black frames, swapped channels, overexposure."""
     seen: dict[bytes, int] = {}
     repeats: list[tuple[int, int]] = []
-    for index in range(len(sequence)):
+    means = _brightness(sequence)
+    for index in np.flatnonzero(means >= _BLACK).tolist():
         digest = hashlib.blake2b(sequence.rgb[index].tobytes(), digest_size=16).digest()
         if digest in seen:
             repeats.append((index, seen[digest]))
@@ -156,7 +157,6 @@ def _images(sequence: EndoscopicSequence) -> Iterator[Finding]:
             frame=sequence.frame_name(index),
             field="rgb",
         )
-    means = _brightness(sequence)
     for index in np.flatnonzero(means < _BLACK)[:1]:
         yield warning(
             "black frame",
@@ -189,8 +189,10 @@ def _images(sequence: EndoscopicSequence) -> Iterator[Finding]:
 
 def _exposure(sequence: EndoscopicSequence) -> Iterator[Finding]:
     """Sudden changes of brightness between neighbours."""
-    means = np.log(np.maximum(_brightness(sequence), 1.0))
-    steps = [(k, float(means[k] - means[j])) for j, k in _neighbours(sequence)]
+    brightness = _brightness(sequence)
+    means = np.log(np.maximum(brightness, 1.0))
+    shown = brightness >= _BLACK
+    steps = [(k, float(means[k] - means[j])) for j, k in _neighbours(sequence) if shown[j] and shown[k]]
     if len(steps) < 4:
         return
     values = np.array([step for _, step in steps])

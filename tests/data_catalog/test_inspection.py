@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from data_catalog.checks import check_depth_scale, check_sequence
-from data_catalog.diagnostics import diagnose
+from data_catalog.diagnostics import _exposure, _images, diagnose
 from data_catalog.inspection import contact_sheet, facts, inspect
 from data_catalog.matches import FrameMatches, match_neighbours, pose_support
 from extrags.cameras import invert_poses, pixel_rays
@@ -313,6 +313,17 @@ class TestPoseSupport:
         support = pose_support(sequence, match_neighbours(sequence))
         assert support.as_given > 0.82
         assert support.best_name == ""
+
+
+def test_black_frames_are_neither_repeats_nor_jumps_of_exposure(clip) -> None:
+    """They were told three times, and the second of them was to be removed as a copy of the first."""
+    rgb = clip.rgb.copy()
+    rgb[4:6] = 0
+    dark = replace(clip, rgb=rgb)
+    assert [finding.topic for check in (_images, _exposure) for finding in check(dark)] == ["black frame"]
+    rgb[7] = rgb[8]
+    (repeat,) = (finding for finding in _images(dark) if finding.topic == "duplicate frame")
+    assert repeat.frame == clip.frame_name(8)
 
 
 class TestDepthScale:
