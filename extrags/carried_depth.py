@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from extrags.cameras import Cameras, project_points, transform_points, unproject_pixels
 from extrags.errors import SourceError
@@ -70,6 +70,7 @@ class Correction:
         shift: of the principal point, as a share of the image's width.
         distortion: radial distortion of a lens that was said to be a pinhole, k of COLMAP's `DIVISION`: a
             pixel at r focal lengths from the principal point sees what a pinhole has at r / (1 + k r^2).
+        time: in frames, by which each frame's pose is taken from later on the path of its recording.
         turn: of each camera about its own axes, a rotation vector in radians.
         move: of each camera along its own axes, in the sequence's unit.
     """
@@ -79,6 +80,7 @@ class Correction:
     log_focal: tuple[float, float] = (0.0, 0.0)
     shift: tuple[float, float] = (0.0, 0.0)
     distortion: float = 0.0
+    time: float = 0.0
     turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
     move: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
@@ -115,10 +117,22 @@ class Correction:
         K[:, [0, 1], [0, 1]] *= fit.K[0, 0] / K[0, 0, 0]
         return K, fit.lens
 
-    def of_poses(self, world_from_camera: Float[np.ndarray, "*b 4 4"]) -> Float[np.ndarray, "*b 4 4"]:
-        """Corrected poses."""
+    def of_poses(
+        self, world_from_camera: Float[np.ndarray, "f 4 4"], recording: Int[np.ndarray, "f"] | None = None
+    ) -> Float[np.ndarray, "f 4 4"]:
+        """Corrected poses.
+
+        Args:
+            world_from_camera: of all frames, in the order of the recording.
+            recording: to which each belongs; None for one.
+        """
         from scipy.spatial.transform import Rotation
 
+        if self.time != 0:
+            owner = np.zeros(len(world_from_camera), int) if recording is None else recording
+            world_from_camera = world_from_camera.copy()
+            for one in np.unique(owner):
+                world_from_camera[owner == one] = _later(world_from_camera[owner == one], self.time)
         further = np.eye(4)
         further[:3, :3] = Rotation.from_rotvec(self.turn).as_matrix()
         further[:3, 3] = self.move
@@ -223,7 +237,9 @@ class CarriedDepth:
         cameras = self.cameras
         if correction is not None:
             K, lens = correction.of_lens(cameras.K, cameras.lens, cameras.width, cameras.height)
-            poses = correction.of_poses(cameras.world_from_camera)
+            sequence = self.sequence
+            poses = correction.of_poses(sequence.cameras.world_from_camera, sequence.recording)
+            poses = poses[sequence.train]
             cameras = replace(cameras, K=K, lens=lens, world_from_camera=poses)
         if motions is None:
             first, second = ([getattr(pair, which) for pair in pairs] for which in ("first", "second"))
@@ -354,6 +370,30 @@ def _moved(
     further[:3, :3] = Rotation.from_rotvec(step[:3]).as_matrix()
     further[:3, 3] = length * step[3:]
     return np.asarray(further @ motion)
+
+
+def _later(poses: Float[np.ndarray, "f 4 4"], frames: float) -> Float[np.ndarray, "f 4 4"]:
+    """Poses of a path so many frames later: splines between its own, beyond them as if it went on evenly."""
+    from scipy.interpolate import CubicSpline
+    from scipy.spatial.transform import Rotation, RotationSpline
+
+    if len(poses) < 2:
+        return poses
+    place = np.arange(len(poses)) + frames
+    before = np.clip(np.floor(place).astype(np.int64), 0, len(poses) - 2)
+    share = place - before
+    here, there = poses[before], poses[before + 1]
+    turn = Rotation.from_matrix(np.swapaxes(here[:, :3, :3], 1, 2) @ there[:, :3, :3]).as_rotvec()
+    found = here.copy()
+    found[:, :3, :3] = here[:, :3, :3] @ Rotation.from_rotvec(share[:, None] * turn).as_matrix()
+    found[:, :3, 3] += share[:, None] * (there[:, :3, 3] - here[:, :3, 3])
+    inside = (place >= 0) & (place <= len(poses) - 1)
+    if len(poses) > 2 and inside.any():
+        times = np.arange(len(poses))
+        turned = RotationSpline(times, Rotation.from_matrix(poses[:, :3, :3]))(place[inside])
+        found[inside, :3, :3] = turned.as_matrix()
+        found[inside, :3, 3] = CubicSpline(times, poses[:, :3, 3])(place[inside])
+    return np.asarray(found)
 
 
 def relative_error(ratios: list[Float[np.ndarray, "_"]]) -> float:

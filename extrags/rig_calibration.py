@@ -1,4 +1,4 @@
-"""What all frames have in common and is off: the reading of depth, the lens, the camera on what is tracked.
+"""What all frames have in common and is off: depth, the lens, the time and place of what is tracked.
 
 Each is a few numbers, and depth that poses carry from frame to frame tells them, since they bend it alike
 everywhere. Poses of single frames that are off, and depth that is off in each frame in another way, do not:
@@ -91,12 +91,14 @@ class _Family:
         scale: of each number, which is about the error that it can have.
         made: the correction of its numbers.
         told: numbers of a correction, in words.
+        starts: of the first number, in its scale; the search begins where the least is left.
     """
 
     words: str
     scale: tuple[float, ...]
     made: Callable[[Float[np.ndarray, "k"]], Correction]
     told: Callable[[Correction], str]
+    starts: tuple[float, ...] = (0.0,)
 
     def of(self, numbers: Float[np.ndarray, "k"]) -> Correction:
         """The correction of numbers that are given in their scales."""
@@ -106,6 +108,15 @@ class _Family:
 def _families(length: float) -> tuple[_Family, ...]:
     """Those there are, from few numbers to more; lengths are in median depths."""
     return (
+        _Family(
+            "poses are of other moments than the frames",
+            (0.6,),
+            lambda x: Correction(time=float(x[0])),
+            lambda c: "each frame gets the pose of {:.2f} frames {} it".format(
+                abs(c.time), "after" if c.time > 0 else "before"
+            ),
+            starts=(0.0, -1 / 0.6, 1 / 0.6, -2 / 0.6, 2 / 0.6),
+        ),
         _Family(
             "depth is not in the unit of the poses, or has an offset",
             (0.1, 0.1 * length),
@@ -162,12 +173,12 @@ def with_calibration_corrected(
 ) -> EndoscopicSequence:
     """The sequence with what its frames have in common corrected, where their depth tells it clearly.
 
-    Depth along the ray becomes z-depth. Of depth's unit and offset, of focal lengths and principal point, of
-    these with a radial distortion, and of a turn and shift of the camera on what is tracked, the one is
-    corrected that leaves least of the disagreement, if that is a quarter of it at most, or unit, offset, turn
-    and shift together; of all frames, held-out ones too. What is left then may be explained by another. A
-    warning says what, and by how much. The sequence is returned as it is where nothing is off, or nothing of
-    this explains it.
+    Depth along the ray becomes z-depth. Of a delay between frames and poses, of depth's unit and offset, of
+    focal lengths and principal point, of these with a radial distortion, and of a turn and shift of the
+    camera on what is tracked, the one is corrected that leaves least of the disagreement, if that is a
+    quarter of it at most, or unit, offset, turn and shift together; of all frames, held-out ones too. What is
+    left then may be explained by another. A warning says what, and by how much. The sequence is returned as
+    it is where nothing is off, or nothing of this explains it.
 
     Args:
         sequence: in any unit.
@@ -199,9 +210,9 @@ def _corrected_once(sequence: EndoscopicSequence, carried: CarriedDepth, lens: b
     families = _families(float(np.median(carried.typical[carried.typical > 0])))
     # Points of the source were found with its poses and lens, and do not follow another.
     rig = sequence.points is None
-    may_change = (True, lens and rig, lens and rig and sequence.lens is None, rig, rig)
+    may_change = (rig, True, lens and rig, lens and rig and sequence.lens is None, rig, rig)
     for candidate in (family for family, may in zip(families, may_change, strict=True) if may):
-        numbers = _fitted(carried, some, candidate, np.zeros(len(candidate.scale)), ROUNDS)
+        numbers = _fitted(carried, some, candidate, _start(carried, some, candidate), ROUNDS)
         if numbers is None or _left(carried, some, candidate, numbers) > hopeful:
             continue
         numbers = _fitted(carried, pairs, candidate, numbers, LAST_ROUNDS)
@@ -218,7 +229,7 @@ def _corrected_once(sequence: EndoscopicSequence, carried: CarriedDepth, lens: b
         sequence.with_changed_depth(lambda _, depth: best.of_depth(depth)),
         K=K,
         lens=radial,
-        world_from_camera=best.of_poses(sequence.cameras.world_from_camera),
+        world_from_camera=best.of_poses(sequence.cameras.world_from_camera, sequence.recording),
     )
 
 
@@ -227,6 +238,15 @@ def _left(
 ) -> float:
     """Disagreement that a correction leaves."""
     return relative_error(carried.log_ratios(pairs, correction=family.of(numbers)))
+
+
+def _start(carried: CarriedDepth, pairs: list[Pair], family: _Family) -> Float[np.ndarray, "k"]:
+    """Numbers that a search begins with."""
+    starts = np.zeros((len(family.starts), len(family.scale)))
+    starts[:, 0] = family.starts
+    if len(starts) == 1:
+        return np.asarray(starts[0])
+    return np.asarray(min(starts, key=lambda numbers: _left(carried, pairs, family, numbers)))
 
 
 def _fitted(
@@ -262,12 +282,12 @@ def _fitted(
         return np.concatenate(parts)
 
     ratio = ratios(numbers)
-    started = relative_error([] if ratio is None else [ratio])
+    given = relative_error([carried.ratio(pair) for pair in pairs])
     for done in range(rounds):
         moved = [ratios(numbers + STEP * axis) for axis in np.eye(len(numbers))]
         if ratio is None or any(part is None for part in moved):
             return None
-        if done == PATIENCE and relative_error([ratio]) > HOPELESS * started:
+        if done == PATIENCE and relative_error([ratio]) > HOPELESS * given:
             return None
         J = np.stack([(part - ratio) / STEP for part in moved if part is not None], axis=1)
         known = np.isfinite(ratio) & np.isfinite(J).all(1)

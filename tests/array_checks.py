@@ -79,8 +79,9 @@ def sampled(plain: Callable[..., Any], decorator: Callable[[Any], Any]) -> Calla
         number = next(calls)
         kinds = (*map(type, given), *named, *map(type, named.values()))
         if number < FIRST_CALLS or number % ONE_OF_CALLS == 0 or kinds not in seen:
+            result = checked()(*given, **named)
             seen.add(kinds)
-            return checked()(*given, **named)
+            return result
         return plain(*given, **named)
 
     vars(called)["checked"] = checked

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from extrags.cameras import pixel_rays
+from extrags.carried_depth import Correction
 from extrags.sequence import EndoscopicSequence
 
 __all__ = ["OTHERWISE_RECORDED", "WRONG", "distorted"]
@@ -89,6 +90,12 @@ def distorted(sequence: Sequence, coefficients: tuple[float, float] = (-0.08, 0.
     return replace(sequence, rgb=rgb, depth_mm=depth, mask=mask)
 
 
+def _late(sequence: Sequence) -> Sequence:
+    """Each frame has the pose of the next one."""
+    poses = Correction(time=1.0).of_poses(sequence.cameras.world_from_camera, sequence.recording)
+    return replace(sequence, world_from_camera=poses)
+
+
 def _hand_eye(sequence: Sequence) -> Sequence:
     further = np.eye(4)
     further[:3, 3] = 1.6, -1.2, 0.0
@@ -141,6 +148,7 @@ WRONG: dict[str, Callable[[Sequence], Sequence]] = {
     "focal": lambda sequence: _lens(sequence, 1.05),
     "principal": lambda sequence: _lens(sequence, shift_px=(1.6, 1.2)),
     "distorted": distorted,
+    "delay": _late,
     "hand-eye": _hand_eye,
     "white balance": lambda sequence: _developed(sequence, _white_balance),
     "haze": lambda sequence: _developed(sequence, _haze(len(sequence.train))),

@@ -109,6 +109,31 @@ def test_a_lens_that_folds_back_inside_the_image_is_no_correction(exact: Endosco
         Correction(distortion=3.0).of_lens(exact.K, None, exact.width, exact.height)
 
 
+@pytest.mark.parametrize("frames", [1.0, -1.0])
+def test_poses_of_another_moment_are_moved_back(
+    exact: EndoscopicSequence, frames: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    poses = exact.cameras.world_from_camera
+    found = with_calibration_corrected(
+        replace(exact, world_from_camera=Correction(time=frames).of_poses(poses))
+    )
+    assert f"1.00 frames {'before' if frames > 0 else 'after'} it" in caplog.text
+    # Where the path ends the pose of a frame before or after is not known.
+    inner = slice(1, -1)
+    np.testing.assert_allclose(found.cameras.world_from_camera[inner], poses[inner], atol=0.02)
+
+
+def test_paths_of_recordings_are_apart_and_one_pose_stays(exact: EndoscopicSequence) -> None:
+    poses = exact.cameras.world_from_camera[:7]
+    half = Correction(time=0.5)
+    both = half.of_poses(poses, np.array([0, 0, 0, 0, 1, 1, 1]))
+    np.testing.assert_array_equal(both[:4], half.of_poses(poses[:4]))
+    np.testing.assert_array_equal(both[4:], half.of_poses(poses[4:]))
+    between = both[:3, :3, 3] - (poses[:3, :3, 3] + poses[1:4, :3, 3]) / 2
+    assert np.linalg.norm(between, axis=1).max() < 0.3
+    np.testing.assert_array_equal(half.of_poses(poses[:1]), poses[:1])
+
+
 def test_depth_along_the_ray_is_converted(
     exact: EndoscopicSequence, caplog: pytest.LogCaptureFixture
 ) -> None:
