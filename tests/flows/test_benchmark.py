@@ -358,6 +358,7 @@ def test_names_are_told_with_their_brackets(capsys: pytest.CaptureFixture[str]) 
 
 
 @pytest.mark.parametrize("command", [["benchmark"], ["bench", "pipeline", "--output", "grid"]])
+@pytest.mark.usefixtures("untouched_environment")
 def test_an_unknown_sequence_is_refused_before_any_run(
     command: list[str],
     tmp_path: Path,

@@ -109,6 +109,7 @@ def test_the_default_profile_is_that_of_the_library() -> None:
         (["benchmark", "--methods", "coarse", "3dgs", "phantom/0"], "--methods"),
     ],
 )
+@pytest.mark.usefixtures("untouched_environment")
 def test_an_option_that_has_taken_the_sequences_is_named(
     arguments: list[str], option: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -118,6 +119,7 @@ def test_an_option_that_has_taken_the_sequences_is_named(
     assert f"; {option} takes all words behind it: other words stand before it, or behind --" in said
 
 
+@pytest.mark.usefixtures("untouched_environment")
 def test_nothing_is_said_of_options_that_have_taken_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["benchmark", "--name", "weekly"]) == 2
     assert "takes all words" not in capsys.readouterr().err

@@ -301,6 +301,7 @@ def test_the_table_says_what_failed(tmp_path: Path) -> None:
     assert "failed" not in grid_markdown(fine)
 
 
+@pytest.mark.usefixtures("untouched_environment")
 def test_the_table_is_printed_line_by_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
