@@ -218,9 +218,9 @@ def _corrected_once(sequence: EndoscopicSequence, carried: CarriedDepth, lens: b
         numbers = _fitted(carried, pairs, candidate, numbers, LAST_ROUNDS)
         if numbers is None:
             continue
-        found, remains = candidate.of(numbers), _left(carried, pairs, candidate, numbers)
+        remains = _left(carried, pairs, candidate, numbers)
         if remains < (left if family is None else SIMPLER * left):
-            best, left, family = found, remains, candidate
+            best, left, family = candidate.of(numbers), remains, candidate
     if family is None:
         return sequence
     _warn(sequence, error, left, family.words, family.told(best))
@@ -306,6 +306,8 @@ def _fitted(
             if ratio is not None:
                 break
             step /= 2
+        if ratio is None:
+            return None
         numbers = numbers + step
         if np.abs(numbers).max() >= PLAUSIBLE:
             return None
