@@ -80,6 +80,10 @@ def optimise(
         poses: corrects the poses of real views during the optimisation.
         footprint: lower bound on the size of Gaussians.
 
+    Returns:
+        What was found; where haze and white balance of frames are learned and there are none, what there was
+        when that was decided: the light has fitted itself to them meanwhile, and who asked begins anew.
+
     Raises:
         DivergedError: when loss, parameters or light stop being finite; names iteration and parameter group.
         NonFiniteError: when the scene given is not finite.
@@ -117,6 +121,8 @@ def optimise(
                 drop_faint_glare(step.light, schedule.light)
             if iteration == schedule.colors_decided_at and step.colors is not None:
                 step.colors.decide()
+                if step.colors.found() is None:
+                    break
             density.step(adam, observation.rendering, iteration)
             last = iteration == schedule.iterations - 1
             if footprint is not None and (last or (iteration + 1) % APPLIED_EVERY == 0):

@@ -46,8 +46,8 @@ GLARE_TRIAL_SHARE = 0.4
 """Of the iterations, after which it is decided whether there is any: it is found early."""
 
 COLOR_TRIAL_SHARE = 0.15
-"""The same for haze and white balance of single frames, where that is enough for so many frames: later, the
-light has to find its way back."""
+"""The same for haze and white balance of single frames, where that is enough for so many frames. Where there
+are none, the scene begins anew, since the light has fitted itself to them."""
 
 
 @one_torch_thread()
@@ -112,7 +112,6 @@ def reconstruct(
         logger.warning("%s: %s", sequence.name, statement)
     # Once, not in every iteration.
     views = [view.to(device) for view in views]
-    order = epochs(len(views), np.random.default_rng(config.seed))
     schedule = coarse_schedule(config, scene_extent(sequence, chosen), depth, stage)
     if earlier is not None:
         schedule = continued_schedule(schedule, earlier.iterations)
@@ -125,14 +124,9 @@ def reconstruct(
             glare_decided_at=glare_decided,
             colors_decided_at=colors_decided if learned and colors_decided <= glare_decided else None,
         )
-    if config.normal_weight > 0:
-        points = start.gaussians.means.numpy()
-        schedule = replace(schedule, normals=NormalTerm.at(points, config, schedule.iterations))
-    cameras, poses = sequence.cameras[chosen], None
-    tried = config.refine_poses == "auto"
-    if earlier is None and refines_poses(sequence, config):
-        poses = PoseRefinement(cameras, config.pose_refinement, depth, config.iterations, tried=tried)
-    elif tried and earlier is None and _poses_can_be_judged(sequence, config):
+    cameras = sequence.cameras[chosen]
+    tried, corrected = config.refine_poses == "auto", earlier is None and refines_poses(sequence, config)
+    if tried and not corrected and earlier is None and _poses_can_be_judged(sequence, config):
         logger.info(
             "%s: poses are taken as they are: %d frames are too many for %d iterations to tell whether they "
             "are off (coarse.refine_poses=auto)",
@@ -140,13 +134,25 @@ def reconstruct(
             len(sequence.train),
             config.iterations,
         )
-    result = optimise(
-        start.to(device),
-        lambda _: views[next(order)],
-        schedule,
-        poses=poses,
-        footprint=smallest_footprint(config, cameras),
-    )
+
+    def optimised(schedule: Schedule) -> TrainingResult:
+        order, poses = epochs(len(views), np.random.default_rng(config.seed)), None
+        if config.normal_weight > 0:
+            points = start.gaussians.means.numpy()
+            schedule = replace(schedule, normals=NormalTerm.at(points, config, schedule.iterations))
+        if corrected:
+            poses = PoseRefinement(cameras, config.pose_refinement, depth, config.iterations, tried=tried)
+        return optimise(
+            start.to(device),
+            lambda _: views[next(order)],
+            schedule,
+            poses=poses,
+            footprint=smallest_footprint(config, cameras),
+        )
+
+    result = optimised(schedule)
+    if schedule.colors_decided_at is not None and result.colors is None:
+        result = optimised(replace(schedule, colors_decided_at=None))
     if (light := result.scene.light) is not None and bool((light.log_glare > -math.inf).any()):
         logger.info(
             "%s: veiling glare; black shows as %s",

@@ -147,6 +147,15 @@ def test_a_hazy_frame_is_found_and_cleared(
     assert np.abs(cleared.rgb[1][dark].astype(int) - 0.77 * tube_sequence.rgb[1][dark]).mean() < 12
 
 
+def test_clear_frames_give_what_they_gave(tube_sequence: EndoscopicSequence) -> None:
+    config = CoarseConfig(iterations=280, max_points=100, densify=DensifyConfig(enabled=False))
+    off = config.model_copy(update={"light": LightConfig(frame_colors=False)})
+    found, expected = (reconstruct(tube_sequence, settings) for settings in (config, off))
+    assert found.colors is None
+    assert torch.equal(found.scene.gaussians.means, expected.scene.gaussians.means)
+    assert found.history == expected.history
+
+
 @pytest.mark.parametrize(
     "change",
     [
