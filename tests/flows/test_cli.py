@@ -140,7 +140,7 @@ class TestStart:
         said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
         assert said.stdout.rstrip().endswith("[]")
 
-    @pytest.mark.parametrize(("words", "meant"), [(["runn", "phantom/0"], "run"), (["cache", "lss"], "ls")])
+    @pytest.mark.parametrize(("words", "meant"), [(["rum", "phantom/0"], "run"), (["cache", "lss"], "ls")])
     def test_a_misspelt_verb(self, words: list[str], meant: str, capsys: pytest.CaptureFixture[str]) -> None:
         assert main(words) == 2
         assert f"; did you mean {meant}? (see extrags" in capsys.readouterr().err
