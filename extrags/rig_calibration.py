@@ -67,10 +67,10 @@ LAST_ROUNDS = 3
 """Of these on all pairs, from where the tried ones arrived."""
 
 PATIENCE = 3
-"""Steps after which so much less has to be left, where the correction is the one."""
+"""Steps after which a correction is given up that still leaves `HOPELESS`."""
 
 HOPELESS = 0.75
-"""Share of the disagreement that is."""
+"""Share of the disagreement."""
 
 HALVINGS = 5
 """Of a step, at most, after which the lens would fold back inside the image."""
@@ -223,8 +223,12 @@ def _corrected_once(sequence: EndoscopicSequence, carried: CarriedDepth, lens: b
             best, left, family = candidate.of(numbers), remains, candidate
     if family is None:
         return sequence
+    try:
+        K, radial = best.of_lens(sequence.K, sequence.lens, sequence.width, sequence.height)
+    except SourceError:
+        # At a fold in the corner of the image, which the smaller maps that were carried have cut off.
+        return sequence
     _warn(sequence, error, left, family.words, family.told(best))
-    K, radial = best.of_lens(sequence.K, sequence.lens, sequence.width, sequence.height)
     return replace(
         sequence.with_changed_depth(lambda _, depth: best.of_depth(depth)),
         K=K,

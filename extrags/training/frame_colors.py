@@ -29,6 +29,7 @@ from extrags.zarr_io import new_group, open_group, read_array, write_array
 __all__ = ["FrameColorFit", "FrameColors", "colored", "with_corrected_colors"]
 
 INITIAL_HAZE = 0.02
+"""What black shows at the start; from .05 a haze is learned faster, and clear frames lose more."""
 LEAST_HAZE = 1e-3
 """A learned haze stays above: at zero it has no gradient that brings it back."""
 HAZE_KEPT_FROM = 0.1
@@ -93,6 +94,8 @@ class FrameColors(Storable):
 
 class FrameColorFit:
     """Haze and balance of each training frame, while they are learned.
+
+    `step` is Adam (Kingma & Ba, ICLR 2015) with moments of its own for each frame.
 
     Args:
         count: number of training frames.
