@@ -13,7 +13,13 @@ from extrags.frame_stacks import empty_stack
 from extrags.sequence import EndoscopicSequence
 from extrags.splits import Split
 
-__all__ = ["never_observed", "observed_by_depth", "observed_by_those_left", "observed_from_depth"]
+__all__ = [
+    "never_observed",
+    "observed_by_depth",
+    "observed_by_those_left",
+    "observed_from_depth",
+    "observed_through_masks",
+]
 
 _LOG = logging.getLogger(__name__)
 
@@ -138,8 +144,35 @@ def observed_by_those_left(
             len(sequence.train) - len(left),
         )
         return None
-    seen = observed_from_depth(sequence.cameras, sequence.mask, depth, left, sequence.test, stage=stage)
-    return np.asarray(seen & sequence.observed)
+    return _seen_again(sequence, sequence.observed, depth, left, stage)
+
+
+def observed_through_masks(
+    sequence: EndoscopicSequence, *, stage: str = "ingest"
+) -> Bool[np.ndarray, "f h w"] | None:
+    """What is observed in held-out frames once masks of training frames have become smaller.
+
+    What was not observed before stays so; as it was where true depth or poses are not known.
+
+    Args:
+        sequence: with the new masks, and what was observed with the old ones.
+        stage: whose progress it is.
+    """
+    depth = sequence.true_depth_mm
+    if sequence.observed is None or depth is None or sequence.world_from_camera is None:
+        return sequence.observed
+    return _seen_again(sequence, sequence.observed, depth, sequence.train, stage)
+
+
+def _seen_again(
+    sequence: EndoscopicSequence,
+    before: Bool[np.ndarray, "f h w"],
+    depth: Float[np.ndarray, "f h w"],
+    train: Int[np.ndarray, "n"],
+    stage: str,
+) -> Bool[np.ndarray, "f h w"]:
+    seen = observed_from_depth(sequence.cameras, sequence.mask, depth, train, sequence.test, stage=stage)
+    return np.asarray(seen & before)
 
 
 def observed_by_depth(

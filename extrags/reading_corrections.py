@@ -5,6 +5,7 @@ from __future__ import annotations
 from extrags.carried_depth import CarriedDepth
 from extrags.config import IngestConfig
 from extrags.depth_noise import with_clean_depth
+from extrags.foreground_objects import without_foreground_objects
 from extrags.measured_depth import as_given, with_depth_error
 from extrags.rig_calibration import with_calibration_corrected
 from extrags.scarce_depth import without_scarce_depth
@@ -19,8 +20,9 @@ def with_corrections(sequence: EndoscopicSequence, config: IngestConfig | None =
 
     In this order, each with a warning where it changes anything: frames that show nothing are left out; depth
     of few frames is left to the evaluation; speckles and noise of depth are taken out; what all frames have
-    in common and is off is corrected; frames whose poses are grossly wrong are left out; and depth that
-    frames disagree about is given an expected error. Of a sequence without poses the first alone.
+    in common and is off is corrected; frames whose poses are grossly wrong are left out; objects in front of
+    the surface are masked; and depth that frames disagree about is given an expected error. Of a sequence
+    without poses the first alone.
 
     Args:
         sequence: as its source has it.
@@ -41,4 +43,8 @@ def with_corrections(sequence: EndoscopicSequence, config: IngestConfig | None =
     given = sequence
     sequence = without_misplaced_frames(given, carried)
     carried = carried if sequence is given else CarriedDepth.of(sequence)
+    if config.mask_foreground:
+        given = sequence
+        sequence = without_foreground_objects(given, carried)
+        carried = carried if sequence is given else CarriedDepth.of(sequence)
     return with_depth_error(sequence, carried, config.depth_error)

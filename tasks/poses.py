@@ -17,15 +17,15 @@ def estimating_settings(config: PosesConfig) -> PosesConfig:
 
 
 def lens_settings(config: IngestConfig) -> IngestConfig:
-    """The settings of reading that say what becomes of depth, and of frames whose lens is found distorted."""
-    kept = ["depth_error", "correct_calibration"]
+    """The settings of reading that say what becomes of depth, masks, and frames of a distorting lens."""
+    kept = ["depth_error", "correct_calibration", "mask_foreground"]
     if config.lens != "pinhole" or config.field_of_view_deg is not None:
         # Sizes are those of a pinhole that is wider than the lens's centre.
         kept += ["lens", "field_of_view_deg", "size", "width", "downscale"]
     return IngestConfig(**{name: getattr(config, name) for name in kept})
 
 
-@stage("poses", version=15)
+@stage("poses", version=16)
 def poses(slot: Slot, sequence: Ref, config: PosesConfig, ingest: IngestConfig | None = None) -> None:
     """Estimate poses; writes `sequence/` without the frames that could not be registered, and `poses.json`.
 

@@ -103,6 +103,11 @@ class IngestConfig(StageConfig):
         "depth tells it clearly: depth along the ray, its unit and offset, focal lengths and principal "
         "point, or the place of the camera on what is tracked",
     )
+    mask_foreground: bool = Field(
+        True,
+        description="of sources with poses and depth: mask what training frames show in front of the "
+        "surface and other frames look through, such as instruments",
+    )
     scale_mm_per_unit: float | None = Field(
         None,
         gt=0,

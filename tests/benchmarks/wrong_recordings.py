@@ -13,7 +13,7 @@ from extrags.cameras import pixel_rays
 from extrags.carried_depth import Correction
 from extrags.sequence import EndoscopicSequence
 
-__all__ = ["OTHERWISE_RECORDED", "WRONG", "distorted"]
+__all__ = ["OTHERWISE_RECORDED", "WRONG", "distorted", "with_instrument"]
 
 Sequence = EndoscopicSequence
 
@@ -136,6 +136,34 @@ def _misplaced(sequence: Sequence) -> Sequence:
     return replace(sequence, world_from_camera=poses)
 
 
+def with_instrument(
+    sequence: Sequence, every: int = 3, near: float = 0.35, width_share: float = 0.09
+) -> tuple[Sequence, np.ndarray]:
+    """An instrument from the lower right into the middle of each so many training frames, and its pixels.
+
+    Args:
+        sequence: with depth.
+        every: 1 is in all training frames.
+        near: its depth, as a share of the frame's median.
+        width_share: of it, of the image's width.
+    """
+    assert sequence.depth_mm is not None
+    generator = np.random.default_rng(506)
+    rgb, depth = np.array(sequence.rgb), np.array(sequence.depth_mm)
+    shown = np.zeros(depth.shape, bool)
+    size = np.array([sequence.width, sequence.height])
+    for frame in np.sort(sequence.train)[::every].tolist():
+        tip, end = (size * generator.uniform(*span) for span in ((0.35, 0.65), ((1.05, 0.7), (1.06, 1.1))))
+        drawn = np.zeros(depth[frame].shape, np.uint8)
+        thickness = max(1, round(width_share * sequence.width))
+        cv2.line(drawn, [int(x) for x in tip], [int(x) for x in end], 1, thickness)
+        z = near * np.median(depth[frame][depth[frame] > 0])
+        shown[frame] = (drawn > 0) & (depth[frame] > z)
+        depth[frame][shown[frame]] = z
+        rgb[frame][shown[frame]] = generator.uniform(60, 120)
+    return replace(sequence, rgb=rgb, depth_mm=depth), shown
+
+
 WRONG: dict[str, Callable[[Sequence], Sequence]] = {
     "smooth": lambda sequence: _depths(sequence, _smooth),
     "frames": lambda sequence: _depths(sequence, _of_frames),
@@ -154,6 +182,8 @@ WRONG: dict[str, Callable[[Sequence], Sequence]] = {
     "haze": lambda sequence: _developed(sequence, _haze(len(sequence.train))),
     "blank": _blank,
     "misplaced": _misplaced,
+    "instrument": lambda sequence: with_instrument(sequence)[0],
+    "instruments": lambda sequence: with_instrument(sequence, every=1)[0],
 }
 """What is wrong, by its name on the command line."""
 
