@@ -125,14 +125,15 @@ def check_axes(sequence: EndoscopicSequence, *, file: object = None, stored: Pos
     if as_given < _SUSPICIOUS_ERROR:
         return
     _refuse_intrinsics_of_another_size(sequence, as_given, file)
+    # Along a narrow part of the image another reading fits by chance, though not as well as the right one.
+    convincing = _CONVINCING_ERROR if _are_wide(sequence, pairs) else _SUSPICIOUS_ERROR
+    least = min(_CLEARLY_BETTER * as_given, convincing)
     fits = [
-        (_reprojection_error(sequence, read, pairs, seen), name)
+        (_reprojection_error(sequence, read, pairs, seen, max(least, _SUSPICIOUS_ERROR)), name)
         for name, read in other_readings(poses, stored)
     ]
     best_error, _ = min(fits)
-    # Along a narrow part of the image another reading fits by chance, though not as well as the right one.
-    convincing = _CONVINCING_ERROR if _are_wide(sequence, pairs) else _SUSPICIOUS_ERROR
-    if best_error < min(_CLEARLY_BETTER * as_given, convincing):
+    if best_error < least:
         if _is_proven_outside(sequence, pairs, file):
             return
         usual = [fit for fit in fits[:USUAL_MISTAKES] if fit[0] < _SUSPICIOUS_ERROR]
@@ -185,16 +186,19 @@ def check_depth_scale(sequence: EndoscopicSequence, *, file: object = None, dept
     if as_given >= _SUSPICIOUS_ERROR:
         _refuse_intrinsics_of_another_size(sequence, as_given, file)
 
-    def error_with(factor: float) -> float:
+    def error_with(factor: float, at_most: float = np.inf) -> float:
         # Depth times a factor beside these poses is this depth beside poses that move by less.
         moved = poses.copy()
         moved[:, :3, 3] /= factor
-        return _reprojection_error(sequence, moved, pairs, seen)
+        return _reprojection_error(sequence, moved, pairs, seen, at_most)
 
-    errors = np.array([error_with(float(factor)) for factor in _DEPTH_FACTORS])
-    factor, best = float(_DEPTH_FACTORS[errors.argmin()]), float(errors.min())
-    clearly_other = max(factor, 1 / factor) >= _CLEARLY_OTHER_FACTOR
-    if not clearly_other or best >= min(_CLEARLY_BETTER * as_given, _CONVINCING_ERROR):
+    # Most factors fit so badly that one pair of frames rules them out.
+    factor, best = np.nan, min(_CLEARLY_BETTER * as_given, _CONVINCING_ERROR)
+    for other in _DEPTH_FACTORS.tolist():
+        error = error_with(other, best)
+        if error < best:
+            factor, best = other, error
+    if not max(factor, 1 / factor) >= _CLEARLY_OTHER_FACTOR:
         return
     if as_given < _SUSPICIOUS_ERROR and (factor > _FAR_FACTOR or best >= _FAR_BETTER * as_given):
         return
@@ -333,6 +337,7 @@ def _reprojection_error(
     poses: Float[np.ndarray, "f 4 4"],
     pairs: list[tuple[int, int]],
     seen: list[Float[np.ndarray, "_ 3"]] | None = None,
+    at_most: float = np.inf,
 ) -> float:
     """Relative difference of carried and found depth: median over a pair's points, mean over pairs.
 
@@ -343,10 +348,19 @@ def _reprojection_error(
         poses: one reading of them.
         pairs: of frames.
         seen: `_seen_points` of the pairs, where several readings are compared.
+        at_most: infinity is returned as soon as it is certain that the mean is more than this.
     """
     if sequence.depth_mm is None:
         return 0.0
-    return float(np.mean([1.0 if e is None else e for e in _pair_errors(sequence, poses, pairs, seen)]))
+    errors: list[float] = []
+    # Of rounding: no mean that is as much as this may count as more.
+    limit = at_most * len(pairs) * (1 + 1e-9)
+    for k, pair in enumerate(pairs):
+        (error,) = _pair_errors(sequence, poses, [pair], None if seen is None else seen[k : k + 1])
+        errors.append(1.0 if error is None else error)
+        if sum(errors) > limit:
+            return np.inf
+    return float(np.mean(errors))
 
 
 def _pair_errors(

@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from data_catalog import checks
 from data_catalog.catalog import read
 from data_catalog.checks import check_sequence, depth_disagreement
 from data_catalog.diagnostics import diagnose
+from data_catalog.pose_conventions import other_readings
 from extrags.cameras import invert_poses
 from extrags.config import IngestConfig
 from extrags.errors import PoseError, SourceError
@@ -118,3 +120,16 @@ def test_the_beginning_of_another_series_is_no_missing_frame(phantom: Endoscopic
     assert "Give each series, as of a left and a right camera" in found["series of frames"]
     gap = tuple(f"frame_{k + (k > 7):03d}" for k in range(len(phantom)))
     assert "missing frame" in topics(replace(phantom, recording=None, frame_names=gap))
+
+
+@pytest.mark.parametrize("at_most", [0.0, 0.02, 0.3, 1.0])
+def test_what_cannot_be_within_a_bound_is_left_early(phantom: EndoscopicSequence, at_most: float) -> None:
+    """No reading that is within it is lost, nor changed."""
+    pairs = checks.neighbouring_frames(phantom)
+    readings = [phantom.world_from_camera, *(poses for _, poses in other_readings(phantom.world_from_camera))]
+    full = np.array([checks._reprojection_error(phantom, poses, pairs) for poses in readings])
+    found = np.array(
+        [checks._reprojection_error(phantom, poses, pairs, at_most=at_most) for poses in readings]
+    )
+    np.testing.assert_array_equal(found, np.where(full <= at_most, full, np.inf))
+    assert (full <= at_most).any() == (at_most > 0)
