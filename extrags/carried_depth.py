@@ -261,41 +261,58 @@ class CarriedDepth:
         every: int,
     ) -> list[Float[np.ndarray, "_"]]:
         """`log_ratios` of a few pairs, by cameras that are corrected already."""
-        K, lens, height, width = cameras.K, cameras.lens, cameras.height, cameras.width
+        lens, height, width = cameras.lens, cameras.height, cameras.width
         first, second = np.array([(pair.first, pair.second) for pair in pairs]).T
         of_first = [self._carried(position) for position in first.tolist()]
         centers = np.concatenate([centers[::every] for centers, _ in of_first])
         z = np.concatenate([depth[::every] for _, depth in of_first])
         counts = [len(depth[::every]) for _, depth in of_first]
+        cuts = np.cumsum([0, *counts])
         z = z if correction is None else correction.of_depth(z)
-        points = unproject_pixels(centers, np.repeat(K[first], counts, axis=0), lens) * z[:, None]
+        # Mostly those of all frames, which need not be repeated for each point.
+        alike = bool((cameras.K == cameras.K[0]).all())
+        of_ray, of_pixel = (
+            cameras.K[0] if alike else np.repeat(cameras.K[which], counts, axis=0)
+            for which in (first, second)
+        )
+        points = unproject_pixels(centers, of_ray, lens) * z[:, None]
         if along_ray:
             points = points * (z / np.linalg.norm(points, axis=1))[:, None]
-        carried = transform_points(np.repeat(motions, counts, axis=0), points)
+        # Of all points one number of the matrix after the other, in which order they are used.
+        of_points = np.repeat(motions.reshape(len(pairs), 16).T, counts, axis=1).reshape(4, 4, -1)
+        carried = transform_points(np.moveaxis(of_points, -1, 0), points)
         reached = np.linalg.norm(carried, axis=1) if along_ray else carried[:, 2]
-        pixels = project_points(carried, np.repeat(K[second], counts, axis=0), lens) - 0.5
+        u, v = project_points(carried, of_pixel, lens).T - 0.5
         with np.errstate(invalid="ignore"):
-            inside = (pixels >= 0).all(1) & (pixels[:, 0] < width - 1) & (pixels[:, 1] < height - 1)
+            inside = (u >= 0) & (v >= 0) & (u < width - 1) & (v < height - 1)
         inside &= (carried[:, 2] > 0) & (z > 0)
-        column, row = np.floor(pixels[inside]).astype(np.int64).T
-        right, down = (pixels[inside] - np.stack([column, row], axis=1)).T
-        corners = np.empty((4, len(row)))
-        ends = np.cumsum([0, *(part.sum() for part in np.split(inside, np.cumsum(counts)[:-1]))]).tolist()
+        u, v = u[inside], v[inside]
+        column, row = np.floor(u).astype(np.int64), np.floor(v).astype(np.int64)
+        right, down = u - column, v - row
+        pixel = row * width + column
+        corners = np.empty((4, len(pixel)))
+        ends = np.concatenate([[0], np.cumsum(inside)])[cuts].tolist()
         for position, begin, end in zip(second.tolist(), ends[:-1], ends[1:], strict=True):
-            inverse, v, u = self._inverse(position), row[begin:end], column[begin:end]
-            for corner, (j, i) in enumerate(((0, 0), (0, 1), (1, 0), (1, 1))):
-                corners[corner, begin:end] = inverse[v + j, u + i]
-        shares = np.stack([(1 - down) * (1 - right), (1 - down) * right, down * (1 - right), down * right])
-        nearest, farthest = corners.max(0), corners.min(0)
+            inverse, of_pair = self._inverse(position).ravel(), pixel[begin:end]
+            for corner, after in enumerate((0, 1, width, width + 1)):
+                corners[corner, begin:end] = inverse[of_pair + after]
+        # One corner after the other: reductions over so few numbers take several times as long.
+        a, b, c, d = corners
+        there = (1 - down) * (1 - right) * a
+        there += (1 - down) * right * b
+        there += down * (1 - right) * c
+        there += down * right * d
+        nearest = np.maximum(np.maximum(a, b), np.maximum(c, d))
+        farthest = np.minimum(np.minimum(a, b), np.minimum(c, d))
         one_surface = (farthest > 0) & (nearest < np.exp(SMOOTH_STEP) * farthest)
         with np.errstate(divide="ignore", invalid="ignore"):
-            there = 1 / (shares * corners).sum(0)
+            there = 1 / there
             ratio = np.log(there if correction is None else correction.of_depth(there)) - np.log(
                 reached[inside]
             )
         found = np.full(len(z), np.nan)
         found[inside] = np.where(one_surface & (np.abs(ratio) < SAME_SURFACE), ratio, np.nan)
-        return np.split(found, np.cumsum(counts)[:-1])
+        return [found[begin:end] for begin, end in zip(cuts[:-1], cuts[1:], strict=True)]
 
     def beyond_motion(self, pair: Pair) -> Float[np.ndarray, "p"]:
         """Log-ratios of a pair after the rigid motion between its cameras that makes them smallest.
