@@ -22,7 +22,7 @@ from extrags.config import IngestConfig
 from extrags.errors import SourceError
 from extrags.lens import Lens, Undistortion
 from extrags.sequence import Split
-from tests.data_catalog.layouts import carried_error_mm, same_frames
+from tests.data_catalog.layouts import AS_STORED, carried_error_mm, same_frames
 
 # Rounding of a rotation to a quaternion and back, of an inverse and back; lengths up to some 100 mm.
 ROUNDING = 1e-12
@@ -277,7 +277,7 @@ class TestFingerprint:
         for folder in ("recording_0", "recording_1"):
             (workspace / "images" / folder).rename(workspace / folder)
         (workspace / "images").rmdir()
-        assert len(read(workspace)) == 10
+        assert len(read(workspace, AS_STORED)) == 10
         before = source_fingerprint(workspace)
         file = workspace / "recording_1" / "0007.png"
         file.write_bytes((workspace / "recording_1" / "0008.png").read_bytes())
@@ -295,7 +295,7 @@ class TestMasks:
     @pytest.mark.parametrize("renamed", ["0000.png.PNG", "0000.png", "0000.PNG", "0000.bmp", "0000.Tif"])
     def test_names_that_are_found(self, varied, tmp_path, renamed) -> None:
         write_colmap(varied, tmp_path)
-        expected = read(tmp_path).mask
+        expected = read(tmp_path, AS_STORED).mask
         assert not expected.all()
         for file in sorted((tmp_path / "masks").iterdir()):
             picture = Image.open(file)
@@ -305,17 +305,17 @@ class TestMasks:
             picture.save(
                 file.with_name(renamed.replace("0000", file.name[:4])), format=kind.replace("Tif", "tiff")
             )
-        np.testing.assert_array_equal(read(tmp_path).mask, expected)
+        np.testing.assert_array_equal(read(tmp_path, AS_STORED).mask, expected)
 
     def test_frames_without_one_are_named(self, workspace, caplog) -> None:
         (workspace / "masks" / "recording_1" / "0007.png.png").unlink()
-        assert read(workspace).mask[7].all()
+        assert read(workspace, AS_STORED).mask[7].all()
         assert caplog.text.count("have no mask") == 1
         assert "1 of 10 frames have no mask and are tissue throughout: recording_1/0007.png" in caplog.text
 
     def test_another_folder_of_masks_is_told_of(self, workspace, caplog) -> None:
         (workspace / "masks").rename(workspace / "mask")
-        assert read(workspace).mask.all()
+        assert read(workspace, AS_STORED).mask.all()
         assert "mask is not read; masks are looked for in masks/" in caplog.text
 
 
@@ -360,12 +360,12 @@ class TestNames:
         for file in sorted((workspace / "masks").rglob("*.png.png")):
             file.rename(file.with_name(file.name.removesuffix(".png")))
         rename_images(workspace, str)
-        expected = read(workspace)
+        expected = read(workspace, AS_STORED)
         if place != "images":
             (workspace / "images").rename(workspace / place)
             (workspace / "images").mkdir()
         rename_images(workspace, lambda name: f"{workspace.resolve()}/{place}/{name}")
-        found = read(workspace)
+        found = read(workspace, AS_STORED)
         same_frames(found, expected, atol=ROUNDING)
         np.testing.assert_array_equal(found.depth_mm, expected.depth_mm)
         np.testing.assert_array_equal(found.recording, expected.recording)
@@ -373,7 +373,7 @@ class TestNames:
     def test_two_spellings_of_one_image_are_refused(self, workspace) -> None:
         rename_images(workspace, lambda name: name.replace("0007", "./0008"))
         with pytest.raises(SourceError, match=r"images\.bin, frame .*0008\.png, field name: .*listed twice"):
-            read(workspace)
+            read(workspace, AS_STORED)
 
 
 class TestPoints:
@@ -395,9 +395,9 @@ class TestPoints:
 
 class TestModelsOfOtherPrograms:
     def test_separators_of_windows(self, workspace) -> None:
-        expected = read(workspace)
+        expected = read(workspace, AS_STORED)
         rename_images(workspace, lambda name: name.replace("/", "\\"))
-        found = read(workspace)
+        found = read(workspace, AS_STORED)
         assert found.frame_names == expected.frame_names
         np.testing.assert_array_equal(found.mask, expected.mask)
         np.testing.assert_array_equal(found.depth_mm, expected.depth_mm)
@@ -411,7 +411,7 @@ class TestModelsOfOtherPrograms:
         for which, listed in (("train", names[:3]), ("test", names[3:5])):
             lines = [name.replace("/", of_lists) for name in listed]
             (workspace / f"{which}_list.txt").write_text("\r\n".join(lines))
-        found = read(workspace)
+        found = read(workspace, AS_STORED)
         assert len(found) == 5
         assert found.test.tolist() == [3, 4]
 
@@ -421,17 +421,17 @@ class TestModelsOfOtherPrograms:
         points[3, 1], points[7, 0] = np.nan, np.inf
         colors = np.repeat(np.arange(20, dtype=np.uint8)[:, None], 3, axis=1)
         write_colmap(clip, tmp_path, binary=binary, points=points, points_rgb=colors)
-        found = read(tmp_path)
+        found = read(tmp_path, AS_STORED)
         kept = [index for index in range(20) if index not in (3, 7)]
         assert found.points_rgb[:, 0].tolist() == kept
         np.testing.assert_array_equal(found.points, points[kept])
         name = "points3D.bin" if binary else "points3D.txt"
         assert f"{name}: 2 of 20 points are not finite and left out" in caplog.text
         write_colmap(clip, tmp_path, binary=binary, points=np.full((2, 3), np.nan))
-        assert read(tmp_path).points is None
+        assert read(tmp_path, AS_STORED).points is None
 
     def test_the_size_of_a_camera_stands_in_another_file(self, workspace) -> None:
         for file in (workspace / "images").rglob("*.png"):
             Image.open(file).resize((48, 38)).save(file)
         with pytest.raises(SourceError, match=r"but cameras\.bin describes a camera of 96 x 77"):
-            read(workspace)
+            read(workspace, AS_STORED)

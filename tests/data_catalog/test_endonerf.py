@@ -13,7 +13,7 @@ from data_catalog.catalog import read, resolve, source_fingerprint
 from data_catalog.inspection import inspect
 from data_catalog.readers.endonerf import mask_polarity, polarity_of_images
 from extrags.errors import SourceError
-from tests.data_catalog.layouts import carried_error_mm, with_tool, write_endonerf
+from tests.data_catalog.layouts import AS_STORED, carried_error_mm, with_tool, write_endonerf
 
 
 def test_poses_come_back(clip, tmp_path) -> None:
@@ -30,8 +30,9 @@ def test_depth_carried_from_frame_to_frame(clip, tmp_path) -> None:
     """Depth is stored in whole millimetres here, which bounds how well it can agree."""
     write_endonerf(clip, tmp_path)
     rounded = replace(clip, depth_mm=np.round(clip.depth_mm))
-    assert carried_error_mm(read(tmp_path)) == pytest.approx(carried_error_mm(rounded), abs=1e-4)
-    assert carried_error_mm(read(tmp_path)) < 0.5
+    found = carried_error_mm(read(tmp_path))
+    assert found == pytest.approx(carried_error_mm(rounded), abs=1e-4)
+    assert found < 0.5
 
 
 @pytest.mark.parametrize("part", ["depth", "masks"])
@@ -82,11 +83,11 @@ class TestNumbersOfNames:
 
     def test_decimals_stay_with_their_frames(self, clip, tmp_path) -> None:
         self.written(clip, tmp_path, "depth")
-        expected = read(tmp_path)
+        expected = read(tmp_path, AS_STORED)
         for part in ("images", "depth"):
             for k, file in enumerate(sorted((tmp_path / part).iterdir())):
                 file.rename(file.with_stem(f"{k * 0.05:g}"))
-        found = read(tmp_path)
+        found = read(tmp_path, AS_STORED)
         assert found.frame_names == tuple(f"{k * 0.05:g}" for k in range(len(found)))
         np.testing.assert_array_equal(found.rgb, expected.rgb)
         np.testing.assert_array_equal(found.depth_mm, expected.depth_mm)
@@ -95,12 +96,12 @@ class TestNumbersOfNames:
     @pytest.mark.parametrize("renamed", ["{}.depth", "depth-{}", "0007_{}_96", "{}_77", "d"])
     def test_names_may_differ_otherwise(self, clip, tmp_path, renamed) -> None:
         self.written(clip, tmp_path, "depth")
-        expected = read(tmp_path).depth_mm
+        expected = read(tmp_path, AS_STORED).depth_mm
         for k, file in enumerate(sorted((tmp_path / "depth").iterdir())):
             # Of "d", letters tell the order, and there is no number.
             stem = f"d{chr(ord('a') + k)}" if renamed == "d" else renamed.format(f"{k + 1:06d}")
             file.rename(file.with_stem(stem))
-        np.testing.assert_array_equal(read(tmp_path).depth_mm, expected)
+        np.testing.assert_array_equal(read(tmp_path, AS_STORED).depth_mm, expected)
 
 
 @pytest.mark.parametrize(
@@ -110,7 +111,7 @@ def test_polarity_is_found_and_stated(clip, tmp_path, caplog, white_is_tissue, f
     sequence, tool = with_tool(clip)
     write_endonerf(sequence, tmp_path, tool != white_is_tissue, mask_folder=folder)
     with caplog.at_level(logging.INFO):
-        back = read(tmp_path)
+        back = read(tmp_path, AS_STORED)
     np.testing.assert_array_equal(back.mask, ~tool)
     stated = "white is tissue, by colour" if white_is_tissue else "white is tool, by colour"
     assert stated in caplog.text

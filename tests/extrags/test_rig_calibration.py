@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from data_catalog.phantom.config import PhantomConfig
+from data_catalog.phantom.recording import Phantom
 from extrags.cameras import pixel_rays, project_points
 from extrags.carried_depth import CarriedDepth, Correction, relative_error
 from extrags.errors import SourceError
 from extrags.lens import Lens
 from extrags.rig_calibration import with_calibration_corrected as corrected
-from extrags.sequence import EndoscopicSequence
+from extrags.sequence import EndoscopicSequence, Split
 from tests.benchmarks.wrong_recordings import distorted
 from tests.extrags.depth.withheld import recorded
 from tests.extrags.test_measured_depth import displaced, smoothly_wrong, with_depth
@@ -182,7 +184,19 @@ def test_unit_and_hand_eye_are_found_together(exact: EndoscopicSequence) -> None
 
 
 def test_larger_maps_are_looked_up_at_every_other_pixel(exact: EndoscopicSequence) -> None:
-    large = recorded(3, 400, 300)
+    # Depth alone: photographs of this size take ten times as long, and nothing looks at them.
+    cameras = exact.cameras[:4].resized(400, 300)
+    phantom = Phantom(PhantomConfig(scene=0))
+    depth = np.stack([phantom.z_depth(cameras[k]) for k in range(4)])
+    large = EndoscopicSequence(
+        name="large maps",
+        rgb=np.zeros((*depth.shape, 3), np.uint8),
+        K=cameras.K,
+        mask=np.isfinite(depth),
+        split=Split("stretch", np.arange(3), np.array([3])),
+        world_from_camera=cameras.world_from_camera,
+        depth_mm=np.where(np.isfinite(depth), depth, 0).astype(np.float32),
+    )
     carried = CarriedDepth(large)
     assert carried.cameras.width == 200
     assert relative_error(carried.log_ratios(carried.pairs)) < 1e-3
