@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -270,7 +271,7 @@ class CarriedDepth:
         cuts = np.cumsum([0, *counts])
         z = z if correction is None else correction.of_depth(z)
         # Mostly those of all frames, which need not be repeated for each point.
-        alike = bool((cameras.K == cameras.K[0]).all())
+        alike = bool((cameras.K[0] == cameras.K).all())
         of_ray, of_pixel = (
             cameras.K[0] if alike else np.repeat(cameras.K[which], counts, axis=0)
             for which in (first, second)
@@ -312,7 +313,7 @@ class CarriedDepth:
             )
         found = np.full(len(z), np.nan)
         found[inside] = np.where(one_surface & (np.abs(ratio) < SAME_SURFACE), ratio, np.nan)
-        return [found[begin:end] for begin, end in zip(cuts[:-1], cuts[1:], strict=True)]
+        return [found[begin:end] for begin, end in pairwise(cuts)]
 
     def beyond_motion(self, pair: Pair) -> Float[np.ndarray, "p"]:
         """Log-ratios of a pair after the rigid motion between its cameras that makes them smallest.
