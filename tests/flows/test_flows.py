@@ -185,9 +185,10 @@ def test_what_a_failed_sequence_had_in_memory_is_gone_when_the_next_begins(
 
     monkeypatch.setattr("extrags.training.reconstruct", reconstruct)
     found = reconstruct_dataset(
-        sequences=[f"phantom/{number}@sparse" for number in range(3)],
+        # Of one colon, which a process paints once, and as few frames as are read at once.
+        sequences=[f"phantom/0@{setting}" for setting in ("sparse", "distanced", "covered")],
         profile="quick",
-        settings=TINY,
+        settings={**TINY, "ingest.max_frames": 6},
         store=str(tmp_path),
         until="coarse",
         max_failed_share=1,
