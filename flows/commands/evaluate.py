@@ -18,6 +18,7 @@ from flows.commands.common import (
     write_json,
 )
 from flows.commands.options import Parser, add_json, add_method, add_sequence
+from flows.commands.run_checks import check_names
 
 __all__ = ["add_arguments", "evaluate"]
 
@@ -74,6 +75,8 @@ def _renders(given: argparse.Namespace) -> dict[str, Any]:
     from flows.environment import prepare
 
     root, config = store_root(given), run_config(given)
+    # A misspelled name leaves no store behind.
+    check_names([given.sequence])
     prepare(Store(root).state, debug=given.debug, looks=True)
     from extrags.metrics.folder import read_renders
     from extrags.metrics.protocol import evaluate_views

@@ -47,6 +47,7 @@ from flows.printable import in_one_line
 if TYPE_CHECKING:
     from extrags.stages import StageName
     from flows.cases import SequenceCase
+    from flows.selection import Chosen
 
 __all__ = ["Several", "add_arguments", "execute", "parsed_matrix", "parsed_methods", "run"]
 
@@ -231,6 +232,7 @@ def execute(
     """
     from extrags.store import Store
     from flows.environment import has_own_home, prepare
+    from flows.selection import absolute_manifests, chosen_sequences
     from flows.temporary_server import start_early, stop_early
 
     say_when_interrupted(RESUMABLE)
@@ -240,6 +242,9 @@ def execute(
     if several.methods == (given.method,):
         # Wrong usage is said before anything is made or loaded.
         run_config(given)
+    # So is a misspelled name, which would leave a store with nothing in it but Prefect's home.
+    chosen = chosen_sequences(sequences)
+    check_names([item.name for item in chosen])
     own_home = has_own_home()
     prepare(Store(root).state, debug=given.debug, looks=True)
     always = refresh or always_flow
@@ -247,7 +252,7 @@ def execute(
     # Without a home the store cannot be written; that is said below where something is to be made.
     if own_home and not finished and Path(os.environ["PREFECT_HOME"]).is_dir():
         start_early()
-    cases = _cases(sequences, given, several, root, until)
+    cases = _cases(chosen, given, several, root, until)
     try:
         found = _without_flow(cases, root, until, always=always, several_seeds=len(several.seeds) > 1)
     except ConfigError:
@@ -266,7 +271,6 @@ def execute(
         _record(cases[0], refused, root, until)
         return _raised(DatasetOutcome([refused]), given)
     from flows.preflight import preflight_cases
-    from flows.selection import absolute_manifests
 
     try:
         preflight_cases(cases, until)
@@ -299,20 +303,16 @@ def execute(
 
 
 def _cases(
-    sequences: list[str], given: argparse.Namespace, several: Several, root: str, until: StageName
+    chosen: Sequence[Chosen], given: argparse.Namespace, several: Several, root: str, until: StageName
 ) -> list[SequenceCase]:
     """What is to be run: every combination of sequences and of what makes several runs of one.
 
     Raises:
-        ConfigError: for wrong settings or manifests.
-        UnknownSequenceError: for a name that is not in the catalogue, or a pattern that matches none.
+        ConfigError: for wrong settings.
         StoreError: when the store cannot be read.
     """
     from flows.cases import cases_of, selected
-    from flows.selection import chosen_sequences
 
-    chosen = chosen_sequences(sequences)
-    check_names([item.name for item in chosen])
     every = cases_of(
         chosen,
         methods=several.methods,

@@ -252,6 +252,21 @@ class TestFinished:
         assert len(Gaussians.read_ply(target)) == first.metrics[scene]["n_gaussians"]
         assert "Gaussians" in capsys.readouterr().out
 
+    @pytest.mark.parametrize("verb", [["run"], ["evaluate", "--renders", "renders"]])
+    def test_a_misspelled_name_leaves_no_store(
+        self,
+        verb: list[str],
+        tmp_path: Path,
+        monkeypatch: pytest.MonkeyPatch,
+        capsys: pytest.CaptureFixture[str],
+    ) -> None:
+        for name in ("PREFECT_HOME", "PREFECT_API_URL"):
+            monkeypatch.delenv(name, raising=False)
+        monkeypatch.chdir(tmp_path)
+        assert main([*verb, "nosuch/0"]) == 2
+        assert "no sequence 'nosuch/0'" in capsys.readouterr().err
+        assert list(tmp_path.iterdir()) == []
+
     @pytest.mark.parametrize("verb", ["report", "export"])
     def test_what_is_not_there_is_said(
         self, verb: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
