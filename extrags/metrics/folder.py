@@ -13,6 +13,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
@@ -30,6 +31,9 @@ from extrags.frame_names import NameOrder, tell_about_order
 from extrags.frame_stacks import stacked
 from extrags.metrics.protocol import RenderedViews
 from extrags.sequence import EndoscopicSequence
+
+if TYPE_CHECKING:
+    from PIL import Image
 
 __all__ = ["read_renders"]
 
@@ -232,7 +236,9 @@ def _depth(file: Path, shape: tuple[int, int], step_mm: float | None) -> Float[n
             values = load_npy(file, most=MOST_PIXELS)
         else:
             with Image.open(file) as image:
-                values = np.asarray(image)
+                values = _numbers(image, file)
+    except SourceError:
+        raise
     except Image.DecompressionBombError as error:
         raise SourceError(TOO_MANY_PIXELS, file=file) from error
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
@@ -248,6 +254,24 @@ def _depth(file: Path, shape: tuple[int, int], step_mm: float | None) -> Float[n
     if not np.isfinite(values).all():
         raise NonFiniteError(f"{file}: depth holds NaN or infinity; 0 means that there is no surface")
     return np.asarray(values.astype(np.float32))
+
+
+def _numbers(image: Image.Image, file: Path) -> np.ndarray:
+    """The pixels of an opened image; a palette of greys, which makes files smaller, is undone.
+
+    Raises:
+        SourceError: for a palette of colours, whose places are no depth.
+    """
+    if image.mode not in ("P", "PA"):
+        return np.asarray(image)
+    colors = np.asarray(image.convert("RGB"))
+    if (colors != colors[..., :1]).any():
+        raise SourceError(
+            "colours of a palette; expected one number per pixel, not depth in false colours",
+            file=file,
+            field="mode",
+        )
+    return colors[..., 0]
 
 
 def _check_size(file: Path, found: tuple[int, ...], expected: tuple[int, int]) -> None:

@@ -288,6 +288,23 @@ class TestRefused:
         with pytest.raises(ShapeError, match="expected two dimensions"):
             read_renders(folder, sequence, depth_folder=depth)
 
+    def test_places_in_a_palette_are_no_depth(self, sequence: EndoscopicSequence, tmp_path: Path) -> None:
+        folder = write(tmp_path / "renders", {f"{index}.png": LEVELS[index] for index in range(3)})
+        (tmp_path / "depth").mkdir()
+        places = np.tile(np.arange(WIDTH, dtype=np.uint8), (HEIGHT, 1))
+        for index in range(3):
+            image = Image.fromarray(places)
+            # Greys from bright to dark: the number of a pixel is not its place.
+            image.putpalette([level for place in range(256) for level in [255 - place] * 3])
+            image.save(tmp_path / "depth" / f"{index}.png")
+        found = read_renders(folder, sequence, depth_folder=tmp_path / "depth", depth_step_mm=0.5)
+        np.testing.assert_allclose(found.depth_mm[0], (255.0 - places) / 2)
+        image.putpalette([level for place in range(256) for level in (place, 0, 255 - place)])
+        image.save(tmp_path / "depth" / "1.png")
+        with pytest.raises(SourceError, match=r"1\.png.*: colours of a palette") as refused:
+            read_renders(folder, sequence, depth_folder=tmp_path / "depth", depth_step_mm=0.5)
+        assert refused.value.file == str(tmp_path / "depth" / "1.png")
+
     def test_larger_than_the_memory(self, sequence: EndoscopicSequence, tmp_path: Path) -> None:
         folder = write(tmp_path / "r", {f"b_{index:04d}.png": LEVELS[index] for index in TEST})
         write_png_header(folder / "b_0003.png", 100_000, 100_000)
