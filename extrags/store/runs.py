@@ -196,6 +196,7 @@ def file_killed(store: Store) -> list[str]:
             continue
         if run.keys:
             content = {"sequence": run.sequence, "ended": run.ended, "keys": sorted(run.keys)}
+            content |= {"config": run.config} if run.config else {}
             content |= {"place": run.place} if run.place else {}
             name = _record_name(run.sequence, run.place, run.keys)
             write_record(store, name, content | {"interrupted": True})

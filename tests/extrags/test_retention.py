@@ -240,7 +240,8 @@ class TestRuns:
     def test_a_killed_run_holds_nothing(self, chain: Store) -> None:
         code = (
             "import os, sys\nfrom extrags.store import Store\nfrom extrags.store.runs import RunRecord\n"
-            "RunRecord(Store(sys.argv[1]), 'phantom/0').add(['other-v1-00'])\nos.kill(os.getpid(), 9)"
+            "RunRecord(Store(sys.argv[1]), 'phantom/0', 'c0', '/p').add(['other-v1-00'])\n"
+            "os.kill(os.getpid(), 9)"
         )
         assert subprocess.run([sys.executable, "-c", code, chain.root]).returncode == -9
         assert active_runs(chain) == []
@@ -252,6 +253,7 @@ class TestRuns:
         assert list((chain.state / "runs" / "active").iterdir()) == []
         (filed,) = runs_of(chain)
         assert (filed.keys, filed.ended) == (run.keys, run.ended)
+        assert (filed.config, filed.place) == (run.config, run.place) == ("c0", "/p")
         assert len(apply_policy(chain, Policy(older_than_s=DAY_S)).removed) == 4
         assert runs_of(chain) == []
 
