@@ -228,6 +228,9 @@ class ViewSession:
         """Begin or end recording the camera's way, as fast as it is flown.
 
         Beginning again goes on after what is recorded; the way in between takes a second.
+
+        Raises:
+            ConfigError: when more than an hour would be recorded; nothing is recorded from then on.
         """
         with self._state:
             if on == self._recording:
@@ -235,9 +238,12 @@ class ViewSession:
             if on:
                 self._recorder.add(self._camera, 1.0)
                 self._recorded_at = self._clock()
-            elif self._clock() > self._recorded_at:
+                self._recording = True
+                return
+            # First: what cannot be added at the end must not keep the recording from ending.
+            self._recording = False
+            if self._clock() > self._recorded_at:
                 self._record_view()
-            self._recording = on
 
     def add_view(self, after_s: float = 2.0) -> None:
         """Record the camera as it is now; the path glides there from the view before in `after_s` seconds."""

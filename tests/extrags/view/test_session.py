@@ -239,3 +239,14 @@ class TestRecording:
         assert not session.recording
         assert session.next_picture(0.0) is not None, "the view goes on"
         assert session.recorded == (1, 0.0)
+
+    def test_a_recording_that_stood_still_for_more_than_an_hour_ends(
+        self, session: ViewSession, clock: Clock
+    ) -> None:
+        session.record(True)
+        clock.now += 4000.0
+        with pytest.raises(ConfigError, match="longer than 60 minutes"):
+            session.record(False)
+        assert not session.recording
+        assert session.recorded == (1, 0.0)
+        session.record(False)
