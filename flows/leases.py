@@ -50,7 +50,7 @@ from extrags.store import Store
 from extrags.store.runs import FORGOTTEN_DAYS
 
 if TYPE_CHECKING:
-    from prefect.client.schemas.objects import State
+    from prefect.client.schemas.objects import State, TaskRun
 
 __all__ = ["FLOWS", "HEARTBEAT", "is_inner_run", "run_lease", "second_look_seconds", "settle_dead_runs"]
 
@@ -236,7 +236,11 @@ def _settle(client: SyncPrefectClient, run: FlowRun, reason: str) -> bool:
             "state": {"type": {"any_": [kind.value for kind in UNENDED]}},
         }
     )
-    for task in client.read_task_runs(task_run_filter=tasks, limit=PAGE):
+    # All are asked for before the first is changed: it would not be among those of the next page any more.
+    unended: list[TaskRun] = []
+    while len(page := client.read_task_runs(task_run_filter=tasks, limit=PAGE, offset=len(unended))) == PAGE:
+        unended += page
+    for task in [*unended, *page]:
         client.set_task_run_state(task.id, state, force=True)
     # Not by force: it may have ended meanwhile, and what the server keeps for it is released.
     client.set_flow_run_state(run.id, state)

@@ -18,7 +18,7 @@ from uuid import UUID, uuid4
 
 import pytest
 from prefect.client.orchestration import get_client
-from prefect.client.schemas.objects import FlowRun, State, StateType
+from prefect.client.schemas.objects import FlowRun, State, StateType, TaskRun
 from prefect.context import FlowRunContext
 from prefect.exceptions import ObjectNotFound
 from prefect.settings import PREFECT_API_URL
@@ -27,7 +27,7 @@ from prefect.states import Completed, Pending, Scheduled
 import flows.leases
 from extrags.store import Store
 from flows.automation import NAME, dead_run_automation, provide_automation
-from flows.leases import run_lease, settle_dead_runs
+from flows.leases import PAGE, run_lease, settle_dead_runs
 from tests.flows.killing import wait_for
 
 pytestmark = pytest.mark.usefixtures("prefect_server")
@@ -145,6 +145,29 @@ def silent(monkeypatch: pytest.MonkeyPatch, run: FlowRun, *, last_beat_s: float 
 
     monkeypatch.setattr(flows.leases, "get_client", lambda **_: Client())
     monkeypatch.setattr(flows.leases, "_settle", lambda *_: True)
+
+
+def test_all_tasks_of_a_dead_run_are_settled_however_many(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Prefect tells of so many at once."""
+    running = [TaskRun(task_key="stage", dynamic_key=str(index)) for index in range(2 * PAGE + 1)]
+    settled: list[UUID] = []
+
+    class Client:
+        def read_task_runs(self, *, task_run_filter: Any, limit: int, offset: int = 0) -> list[TaskRun]:
+            left = [task for task in running if task.id not in settled]
+            return left[offset : offset + limit]
+
+        def set_task_run_state(self, task: UUID, state: State[Any], *, force: bool) -> None:
+            settled.append(task)
+
+        def set_flow_run_state(self, *_: Any) -> None: ...
+
+        def read_flow_run(self, run: UUID) -> FlowRun:
+            return FlowRun(id=run, flow_id=uuid4(), state_type=StateType.CRASHED)
+
+    client: Any = Client()
+    assert flows.leases._settle(client, FlowRun(flow_id=uuid4(), name="dead"), "its process is gone")
+    assert sorted(settled) == sorted(task.id for task in running)
 
 
 @pytest.mark.parametrize(("last_beat_s", "dead"), [(None, False), (400.0, False), (600.0, True)])
