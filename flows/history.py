@@ -252,8 +252,10 @@ def judge(entry: Mapping[str, Any], earlier: Sequence[Mapping[str, Any]], tolera
         else:
             was, value = median(times), now[clock]
             if value - was > max(tolerance.seconds_share * was, tolerance.seconds):
+                # What took no time, as what was in the store already, has no share of it.
+                more = f"{value / was - 1:.0%}" if was > 0 else f"{value - was:.1f} s"
                 found.regressions.append(
-                    f"{label}: {value:.1f} s{kind}, {value / was - 1:.0%} above the median {was:.1f} s of "
+                    f"{label}: {value:.1f} s{kind}, {more} above the median {was:.1f} s of "
                     f"{len(times)} runs (tolerance {tolerance.seconds_share:.0%})"
                 )
     return found

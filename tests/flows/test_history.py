@@ -191,6 +191,12 @@ class TestRegressions:
         assert judge(entry(seconds=8), quick, Tolerance()).regressions == []
         assert judge(entry(seconds=8), quick, Tolerance(seconds=1)).regressions != []
 
+    def test_runs_that_took_no_time_have_no_share_of_it(self) -> None:
+        at_once = [entry(day=day, seconds=0, seeds=(0,)) for day in range(1, 6)]
+        assert judge(entry(seconds=0, seeds=(0,)), at_once, Tolerance()).regressions == []
+        (slower,) = judge(entry(seconds=8, seeds=(0,)), at_once, Tolerance()).regressions
+        assert "8.0 s, 8.0 s above the median 0.0 s of 5 runs" in slower
+
 
 class TestRecords:
     def test_only_appended_to(self, tmp_path: Path) -> None:
