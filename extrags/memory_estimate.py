@@ -107,6 +107,8 @@ class FrameSize:
         width: in pixels, as the frames are used (after `ingest.*`).
         height: in pixels.
         source_pixels: of one frame on disk; None: as many as are used.
+        held_out_frames: of these; None: all that are no training frames. Fewer where frames are in neither
+            part, as those that show nothing.
     """
 
     frames: int
@@ -114,6 +116,7 @@ class FrameSize:
     width: int
     height: int
     source_pixels: int | None = None
+    held_out_frames: int | None = None
 
 
 @dataclass(frozen=True)
@@ -191,7 +194,8 @@ def estimate_memory(
     matched = round(pixels * min(1.0, config.depth.max_width / size.width) ** 2)
     looked_at = round(pixels * min(1.0, config.poses.max_width / size.width) ** 2)
     features = FEATURES * threads * looked_at
-    held_out = max(1, all_frames - train)
+    in_test = all_frames - train if size.held_out_frames is None else size.held_out_frames
+    held_out = max(1, in_test)
     # Each thread has images of its own, as long as there are some.
     measured = min(threads * max(pixels, PIXELS_MEASURED_AT_ONCE), held_out * pixels)
     metrics = (METRICS_VGG if "vgg" in config.evaluate.lpips_nets else METRICS) * measured
@@ -199,7 +203,7 @@ def estimate_memory(
     rendered = _held(RENDERED_STACKS, held_out * pixels)
     true_surface = _held(TRUE_SURFACE_STACKS, all_frames * pixels)
     # The oracle alone optimises with held-out frames too.
-    trained_on = all_frames if config.coarse.train_on == "all" else train
+    trained_on = train + in_test if config.coarse.train_on == "all" else train
     # Held-out views are restored as well, in clips.
     restored = (
         references

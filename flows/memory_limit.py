@@ -50,7 +50,10 @@ def check_memory(
     Raises:
         ConfigError: when the estimate exceeds the limit; names settings that fit.
     """
-    size = FrameSize(int(counts["frames"]), int(counts["train"]), int(counts["width"]), int(counts["height"]))
+    frames, train, test, width, height = (
+        int(counts[name] or 0) for name in ("frames", "train", "test", "width", "height")
+    )
+    size = FrameSize(frames, train, width, height, held_out_frames=test)
     threads = usable_cores()
     leave_out = set(STAGES).difference(frames_stages(counts, config, leave_out))
     found = estimate_memory(config, size, threads=threads, until=until, leave_out=leave_out)

@@ -124,6 +124,15 @@ class TestEstimate:
 
         assert coarse(oracle, few) == coarse(config, all_) > coarse(config, few)
 
+    def test_frames_of_neither_part_are_read_and_no_more(self) -> None:
+        oracle = profile_config("balanced").with_overrides({"coarse.train_on": "all"})
+        whole = FrameSize(600, 60, 675, 540)
+        found = estimate_memory(oracle, replace(whole, held_out_frames=60)).by_stage
+        fewer = estimate_memory(oracle, FrameSize(120, 60, 675, 540)).by_stage
+        more = estimate_memory(oracle, whole).by_stage
+        assert more["ingest"] == found["ingest"] > fewer["ingest"]
+        assert more["coarse"] > found["coarse"] == fewer["coarse"]
+
     def test_covers_many_full_size_training_frames(self) -> None:
         """A bound: measured were 20 iterations, long before there are as many Gaussians as there may be."""
         found = estimate_memory(profile_config("quick"), SYNTHETIC)
