@@ -15,7 +15,7 @@ from data_catalog.inside import inside
 from extrags.array_files import MOST_PIXELS, TOO_MANY_PIXELS, load_npy
 from extrags.errors import SourceError, SourceNotFoundError, reason_of
 from extrags.events import Progress, emit
-from extrags.frame_names import COLOR_SUFFIXES, NameOrder
+from extrags.frame_names import COLOR_SUFFIXES, NameOrder, names_in_folders
 from extrags.sequence import EndoscopicSequence
 
 __all__ = [
@@ -321,12 +321,8 @@ def save_images(sequence: EndoscopicSequence, folder: Path) -> list[str]:
     """
     from PIL import Image
 
-    several = sequence.recording is not None and len(np.unique(sequence.recording)) > 1
     names = []
-    for index in range(len(sequence)):
-        name = sequence.frame_name(index)
-        if several and sequence.recording is not None and "/" not in name:
-            name = f"recording_{int(sequence.recording[index])}/{name}"
+    for index, name in enumerate(names_in_folders(sequence)):
         # Names come from sources; nothing is written beside the folder.
         inside(folder / "images", f"{name}.png", file=folder, frame=index, field="name")
         names.append(f"{name}.png")

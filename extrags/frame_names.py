@@ -16,13 +16,19 @@ from decimal import Decimal
 from itertools import groupby, pairwise
 from math import gcd
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from extrags.sequence import EndoscopicSequence
 
 __all__ = [
     "COLOR_SUFFIXES",
     "NameOrder",
     "file_key",
     "is_gap",
+    "names_in_folders",
     "natural_key",
     "order_for_fingerprint",
     "tell_about_order",
@@ -386,3 +392,19 @@ def tell_about_order(place: Path, order: NameOrder) -> None:
             *pair,
             extra={"topic": "order of frames", "field": "frame names"},
         )
+
+
+def names_in_folders(sequence: EndoscopicSequence) -> list[str]:
+    """Names of all frames as exporters write them: those of several recordings in folders of their own.
+
+    `recording_N/NAME`, unless the name says a folder. Recordings of which no frame is in either part of the
+    split do not count, since exporters leave them out.
+    """
+    names = [sequence.frame_name(index) for index in range(len(sequence))]
+    recording = sequence.recording
+    if recording is None or len(np.unique(recording[sequence.split.frames])) < 2:
+        return names
+    return [
+        name if "/" in name else f"recording_{int(number)}/{name}"
+        for name, number in zip(names, recording, strict=True)
+    ]

@@ -3,8 +3,9 @@
 The images show the held-out frames of a sequence. They are matched by name (`b_0010.png` for the frame
 `b_0010`) if every file name is that of a frame; otherwise by number: as many files as held-out frames, sorted
 by the numbers in their names, for the frames in the order of the split. Frames named with their folders may
-stand in folders of these names (`left/0010.png`), and must where held-out frames of different folders share a
-name. Files and folders whose names begin with a dot are none of them.
+stand in folders of these names (`left/0010.png`), those of several recordings in folders of these, as
+exporters write them (`recording_1/0010.png`); they must where held-out frames share a name. Files and folders
+whose names begin with a dot are none of them.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from extrags.errors import (
     SourceNotFoundError,
     reason_of,
 )
-from extrags.frame_names import NameOrder, tell_about_order
+from extrags.frame_names import NameOrder, names_in_folders, tell_about_order
 from extrags.frame_stacks import stacked
 from extrags.metrics.protocol import RenderedViews
 from extrags.sequence import EndoscopicSequence
@@ -101,7 +102,8 @@ def _files_of(
     """One file per held-out frame, in their order."""
     if not folder.is_dir():
         raise SourceNotFoundError(f"there is no such folder of {kind}s", file=folder)
-    paths = [_bare(sequence.frame_name(int(frame))) for frame in sequence.test]
+    placed = names_in_folders(sequence)
+    paths = [_bare(placed[int(frame)]) for frame in sequence.test]
     in_folders = _files_at(paths, folder, suffixes)
     if in_folders:
         return _named(paths, _by_name(in_folders, kind), folder, sequence, kind)
@@ -183,8 +185,9 @@ def _named(
     if shared:
         raise SourceError(
             f"{len(shared)} names are those of several held-out frames of {sequence.name} ({_some(shared)}); "
-            f"put the {kind}s in the frames' folders, or give them names that are none of a frame and have a "
-            f"number",
+            f"put the {kind}s in the frames' folders, those of several recordings in recording_0, "
+            f"recording_1, ..., as extrags export does, or give them names that are none of a frame and "
+            f"have a number",
             file=folder,
         )
     missing = [name for name in wanted if name not in files]

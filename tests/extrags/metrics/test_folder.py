@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from data_catalog.images import save_images
 from extrags import frame_stacks
 from extrags.errors import ConfigError, NonFiniteError, ShapeError, SourceError, SourceNotFoundError
 from extrags.metrics.folder import _color, read_renders
@@ -86,6 +87,33 @@ def test_frames_named_like_files(sequence: EndoscopicSequence, tmp_path: Path) -
     named = replace(sequence, frame_names=tuple(f"rgb/b_{index:04d}.png" for index in range(FRAMES)))
     folder = write(tmp_path / "renders", {f"b_{index:04d}.png": LEVELS[index] for index in TEST})
     np.testing.assert_array_equal(np.rint(read_renders(folder, named).rgb * 255), LEVELS[TEST])
+
+
+class TestFramesOfSeveralRecordings:
+    """As `extrags export` writes them; the numbers of each recording begin anew."""
+
+    @pytest.fixture
+    def several(self, sequence: EndoscopicSequence) -> EndoscopicSequence:
+        names = ("0000", "0001", "0000", "0001", "0002")
+        return replace(sequence, frame_names=names, recording=np.array([0, 0, 1, 1, 1]))
+
+    def test_in_the_folders_of_an_export(self, several: EndoscopicSequence, tmp_path: Path) -> None:
+        names = save_images(several, tmp_path)
+        assert names[3] == "recording_1/0001.png"
+        renders = read_renders(tmp_path / "images", several)
+        np.testing.assert_array_equal(np.rint(renders.rgb * 255), LEVELS[TEST])
+        (tmp_path / "images" / "recording_1" / "0002.png").unlink()
+        with pytest.raises(SourceNotFoundError, match=r"no image: recording_1/0002$"):
+            read_renders(tmp_path / "images", several)
+
+    def test_bare_names_are_told_where_to_be(self, several: EndoscopicSequence, tmp_path: Path) -> None:
+        folder = write(tmp_path / "bare", {f"{name}.png": LEVELS[0] for name in ("0000", "0001", "0002")})
+        with pytest.raises(SourceError, match=r"\(0001\); put the images in .*recording_0, recording_1"):
+            read_renders(folder, several)
+        told_apart = replace(several, frame_names=("a0", "a1", "b0", "b1", "b2"))
+        names = {f"{told_apart.frame_name(index)}.png": LEVELS[index] for index in TEST}
+        renders = read_renders(write(tmp_path / "told_apart", names), told_apart)
+        np.testing.assert_array_equal(np.rint(renders.rgb * 255), LEVELS[TEST])
 
 
 class TestFramesOfDifferentFolders:
