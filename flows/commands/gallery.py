@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = ["add_arguments", "gallery"]
 
+PAGE_SUFFIXES = frozenset({".md", ".markdown", ".html", ".htm"})
 TITLE, LARGEST_KB = "Gallery", 1000
 """What the page is called, and how large its images are together, where nothing else is asked for."""
 
@@ -56,8 +57,22 @@ def add_arguments(parser: Parser) -> None:
         help="bound on all images together (default: %(default)s)",
     )
     add_output(
-        parser, "FOLDER", output_folder, default="gallery", help="for page and images (default: %(default)s)"
+        parser, "FOLDER", _page_folder, default="gallery", help="for page and images (default: %(default)s)"
     )
+
+
+def _page_folder(text: str) -> str:
+    """As `output_folder`; the name of a page is that of a file, though other verbs take it.
+
+    Raises:
+        ArgumentTypeError: for a file or the name of a page, or when nothing can be made there.
+    """
+    place = output_folder(text)
+    if Path(place).suffix.lower() in PAGE_SUFFIXES and not Path(place).exists():
+        raise argparse.ArgumentTypeError(
+            f"{text} is the name of a page; expected a folder, into which index.md and its images are written"
+        )
+    return place
 
 
 def gallery(given: argparse.Namespace) -> int:

@@ -78,6 +78,22 @@ def test_every_verb_looks_before_it_begins(
     assert "cannot be written: nothing can be made in" in capsys.readouterr().err
 
 
+def test_a_gallery_is_no_page_of_the_name_given(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Other verbs write pages under `--output`; a folder of this name was made."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("x.md", "new/x.HTML"):
+        assert main(["gallery", "--output", name]) == 2
+        assert f"{name} is the name of a page; expected a folder, into which" in capsys.readouterr().err
+    assert os.listdir(tmp_path) == []
+    # One that is there is taken, and so is a version in a name.
+    (tmp_path / "x.md").mkdir()
+    for name in ("x.md", "gallery_v1.2"):
+        assert main(["gallery", "--output", name, "--store", "nowhere"]) != 2
+        assert "is the name of a page" not in capsys.readouterr().err
+
+
 def test_folders_are_made_and_files_are_whole(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
