@@ -40,6 +40,11 @@ __all__ = [
 # this is not rounding, but a matrix that is no rotation.
 ROTATION_TOLERANCE = 1e-2
 
+_ROUNDED_TOLERANCE = {1: 0.15, 2: 0.015}
+"""How far (Frobenius) a rotation may be from SO(3) whose entries have so many digits after the point: each of
+nine is off by half of the last one. With one digit cameras are turned by up to 4 degrees, with two by less
+than half a degree."""
+
 
 @dataclass(frozen=True, slots=True)
 class Cameras:
@@ -230,7 +235,7 @@ def as_rotation(
 
     Raises:
         PoseError: for non-finite entries, a mirrored matrix (det < 0), or one further than
-            `ROTATION_TOLERANCE` from SO(3).
+            `ROTATION_TOLERANCE` from SO(3), unless two digits after the point explain it.
     """
     if not np.isfinite(matrix).all():
         raise PoseError(
@@ -246,15 +251,29 @@ def as_rotation(
             frame=frame,
             field="world_from_camera",
         )
-    if float(np.abs(singular - 1).max()) > ROTATION_TOLERANCE:
+    digits = _digits(matrix)
+    is_rounded = float(np.linalg.norm(singular - 1)) <= _ROUNDED_TOLERANCE.get(digits, 0.0)
+    if float(np.abs(singular - 1).max()) > ROTATION_TOLERANCE and not (is_rounded and digits > 1):
+        perhaps = "Is the matrix scaled, sheared or transposed?"
+        if is_rounded:
+            perhaps = (
+                "Its entries have one digit after the point, which turns a camera by degrees: write six. If "
+                "they are not rounded, the matrix is scaled or sheared"
+            )
         raise PoseError(
-            f"not a rotation: singular values {np.round(singular, 4).tolist()}, expected 1, 1, 1. "
-            "Is the matrix scaled, sheared or transposed?",
+            f"not a rotation: singular values {np.round(singular, 4).tolist()}, expected 1, 1, 1. {perhaps}",
             file=file,
             frame=frame,
             field="world_from_camera",
         )
     return np.asarray(u @ vt, dtype=np.float64)
+
+
+def _digits(matrix: Float[np.ndarray, "3 3"]) -> int:
+    """How many digits after the point the entries have; 3 stands for more, and for no rotation's entries."""
+    if np.abs(matrix).max() > 1:
+        return 3
+    return next((n for n in (1, 2) if np.allclose(matrix, np.round(matrix, n), rtol=0, atol=1e-9)), 3)
 
 
 def invert_poses(poses: Float[np.ndarray, "*b 4 4"]) -> Float[np.ndarray, "*b 4 4"]:

@@ -206,6 +206,19 @@ class TestRotations:
                 with pytest.raises(PoseError, match="not a rotation"):
                     as_rotation(scale * rotation)
 
+    def test_rounding_is_told_from_shear(self) -> None:
+        """Two digits are enough for any rotation; with one a camera is turned by degrees."""
+        rotations = Rotation.random(4000, random_state=np.random.default_rng(0)).as_matrix()
+        worst = [np.abs(np.linalg.svd(np.round(one, 2))[1] - 1).max() for one in rotations]
+        assert max(worst) > 0.01
+        rotation = rotations[np.argmax(worst)]
+        np.testing.assert_allclose(as_rotation(np.round(rotation, 2)), rotation, atol=0.01)
+        with pytest.raises(PoseError, match=r"not a rotation.*one digit after the point.*write six"):
+            as_rotation(np.round(rotation_about(np.array([0.0, 0, 1]), np.radians(45)), 1))
+        for sheared in (np.eye(3) + 0.2 * np.eye(3, k=1), 0.9 * np.eye(3), 1.1 * np.eye(3)):
+            with pytest.raises(PoseError, match="scaled, sheared or transposed"):
+                as_rotation(sheared)
+
     def test_rodrigues_agrees_with_scipy(self) -> None:
         axis = np.array([1.0, -2.0, 0.5])
         expected = Rotation.from_rotvec(0.7 * axis / np.linalg.norm(axis)).as_matrix()
