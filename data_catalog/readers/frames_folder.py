@@ -56,7 +56,16 @@ from data_catalog.readers.beside_frames import (
     tell_about_pictures,
     tell_what_is_not_read,
 )
-from data_catalog.readers.intrinsics_entries import PINHOLE_KEYS, check_described, number_of
+from data_catalog.readers.intrinsics_entries import (
+    ANGLE,
+    EXPECTED,
+    PINHOLE_KEYS,
+    check_complete,
+    check_described,
+    check_is_degrees,
+    number_of,
+    of_angle,
+)
 from data_catalog.readers.stereo_frames import (
     FramesOfCamera,
     StereoFolders,
@@ -94,10 +103,8 @@ FEWEST_FRAMES = 4
 """Fewer stills beside a video are pictures about it: poses could not be estimated from them."""
 _CLEARLY_MORE = 2
 _LOOKED_AT_FOR_COMBS = 12
-_ANGLE = "field_of_view_deg"
 _AGREEING = 0.01
 """So far apart, relatively, may be what an `intrinsics.json` tells twice: angles are rounded."""
-_EXPECTED = "expected K, or fx, fy, cx, cy, or field_of_view_deg"
 
 
 def is_mask(file: Path) -> bool:
@@ -369,7 +376,7 @@ def states_angle_alone(folder: Path, config: IngestConfig) -> bool:
     if stated_intrinsics(folder, config) == "guessed":
         return False
     content = _content(folder / INTRINSICS_FILE)
-    return _ANGLE in content and not any(key in content for key in ("K", *PINHOLE_KEYS))
+    return ANGLE in content and not any(key in content for key in ("K", *PINHOLE_KEYS))
 
 
 def read_intrinsics(
@@ -424,10 +431,11 @@ def read_intrinsics(
         check_described(content, width, height, file, are_turned=are_turned)
         if "K" in content:
             K = np.asarray(content["K"], dtype=np.float64)
-        elif _ANGLE in content and not any(key in content for key in PINHOLE_KEYS):
-            K = _of_angle(content, width, height, pixel_aspect, file)
+        elif ANGLE in content and not any(key in content for key in PINHOLE_KEYS):
+            check_is_degrees(content, file)
+            K = of_angle(content, width, height, pixel_aspect, file)
         else:
-            _check_complete(content, file)
+            check_complete(content, file)
             fx, fy, cx, cy = (number_of(content, key, file) for key in PINHOLE_KEYS)
             K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
         if K.shape != (3, 3):
@@ -437,7 +445,7 @@ def read_intrinsics(
     except SourceError:
         raise
     except (OverflowError, RecursionError, TypeError, ValueError) as error:
-        raise SourceError(f"{_EXPECTED}: {error}", file=file, field="K") from error
+        raise SourceError(f"{EXPECTED}: {error}", file=file, field="K") from error
     return K
 
 
@@ -450,24 +458,10 @@ def _content(file: Path) -> dict[str, Any]:
     try:
         content = json.loads(file.read_text(encoding="utf-8-sig"))
     except (RecursionError, ValueError) as error:
-        raise SourceError(f"{_EXPECTED}: {error}", file=file, field="K") from error
+        raise SourceError(f"{EXPECTED}: {error}", file=file, field="K") from error
     if not isinstance(content, dict):
-        raise SourceError(f"{_EXPECTED}: found {type(content).__name__}, not an object", file=file, field="K")
+        raise SourceError(f"{EXPECTED}: found {type(content).__name__}, not an object", file=file, field="K")
     return content
-
-
-def _of_angle(
-    content: dict[str, Any], width: int, height: int, pixel_aspect: float, file: Path
-) -> Float[np.ndarray, "3 3"]:
-    """K of the field of view that is stated.
-
-    Raises:
-        SourceError: it is none of a pinhole.
-    """
-    angle = number_of(content, _ANGLE, file)
-    if not 1 < angle < 179:
-        raise SourceError(f"{angle:g} degrees; expected 1 to 179 for a pinhole", file=file, field=_ANGLE)
-    return intrinsics_of_field_of_view(angle, width, height, pixel_aspect=pixel_aspect)
 
 
 def _check_agreement(
@@ -496,28 +490,13 @@ def _check_agreement(
                 file=file,
                 field=f"{key}, {taken}",
             )
-    if _ANGLE in content:
-        focal_px = _of_angle(content, width, height, 1.0, file)[0, 0]
+    if ANGLE in content:
+        focal_px = of_angle(content, width, height, 1.0, file)[0, 0]
         if not abs(focal_px - K[0, 0]) <= _AGREEING * K[0, 0]:
             raise SourceError(
-                f"{number_of(content, _ANGLE, file):g} degrees over {width} pixels are a focal length of "
+                f"{number_of(content, ANGLE, file):g} degrees over {width} pixels are a focal length of "
                 f"{focal_px:.4g} px, and {taken} makes it {K[0, 0]:.4g}; expected one of the two, or the "
                 "same twice",
                 file=file,
-                field=f"{_ANGLE}, {taken}",
+                field=f"{ANGLE}, {taken}",
             )
-
-
-def _check_complete(content: dict[str, Any], file: Path) -> None:
-    """Refuse a pinhole of which something is not stated.
-
-    Raises:
-        SourceError: names what is missing.
-    """
-    absent = [key for key in PINHOLE_KEYS if key not in content]
-    if absent:
-        listed = ", ".join(absent)
-        missing = (
-            f"no K, no field_of_view_deg and no {listed}" if absent == [*PINHOLE_KEYS] else f"no {listed}"
-        )
-        raise SourceError(f"{missing}; {_EXPECTED}", file=file, field="K")

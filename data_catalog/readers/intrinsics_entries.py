@@ -1,18 +1,35 @@
-"""What an `intrinsics.json` says beside the numbers of its pinhole, and what of it is refused."""
+"""What an `intrinsics.json` says beside the numbers of its pinhole, or in their place; what is refused."""
 
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float
+
+from data_catalog.guessed_intrinsics import intrinsics_of_field_of_view
 from data_catalog.lens_entries import SIZE_NAMES, check_pinhole
 from data_catalog.readers.unknown_keys import warn_of_unknown_keys
 from extrags.errors import SourceError
 
-__all__ = ["PINHOLE_KEYS", "check_described", "number_of"]
+__all__ = [
+    "ANGLE",
+    "EXPECTED",
+    "PINHOLE_KEYS",
+    "check_complete",
+    "check_described",
+    "check_is_degrees",
+    "number_of",
+    "of_angle",
+]
+
+ANGLE = "field_of_view_deg"
+EXPECTED = "expected K, or fx, fy, cx, cy, or field_of_view_deg"
 
 PINHOLE_KEYS = ("fx", "fy", "cx", "cy")
 _SKEW = "skew"
@@ -21,7 +38,8 @@ _PAIRS = (
     *zip(SIZE_NAMES["width"], SIZE_NAMES["height"], strict=True),
 )
 _BOTH = (*SIZE_NAMES["size"], "resolution")
-_KNOWN = ("K", *PINHOLE_KEYS, "field_of_view_deg", _SKEW, *_BOTH, *(name for pair in _PAIRS for name in pair))
+_KNOWN = ("K", *PINHOLE_KEYS, ANGLE, _SKEW, *_BOTH, *(name for pair in _PAIRS for name in pair))
+_NAMED_ANGLE = re.compile(r"fov|field_?of_?view|camera_?angle", re.IGNORECASE)
 _INSTEAD = "Describe a lens with distortion in a calibration file (ingest.calibration)"
 
 
@@ -74,6 +92,62 @@ def number_of(content: Mapping[str, Any], key: str, file: Path) -> float:
         return float(content[key])
     except (OverflowError, TypeError, ValueError) as error:
         raise SourceError(f"{json.dumps(content[key])}; expected a number", file=file, field=key) from error
+
+
+def of_angle(
+    content: Mapping[str, Any], width: int, height: int, pixel_aspect: float, file: Path
+) -> Float[np.ndarray, "3 3"]:
+    """K of the field of view that is stated.
+
+    Args:
+        content: of the file, with `field_of_view_deg`.
+        width: of the images, in pixels.
+        height: of the images, in pixels.
+        pixel_aspect: width of a pixel over its height.
+        file: named in messages.
+
+    Raises:
+        SourceError: it is none of a pinhole.
+    """
+    angle = number_of(content, ANGLE, file)
+    if not 1 < angle < 179:
+        raise SourceError(f"{angle:g} degrees; expected 1 to 179 for a pinhole", file=file, field=ANGLE)
+    return intrinsics_of_field_of_view(angle, width, height, pixel_aspect=pixel_aspect)
+
+
+def check_is_degrees(content: Mapping[str, Any], file: Path) -> None:
+    """Refuse a field of view that is stated alone and as narrow as no endoscope's: it is in radians.
+
+    Raises:
+        SourceError: says how many degrees these are.
+    """
+    angle = number_of(content, ANGLE, file)
+    if 0 < angle <= math.pi:
+        raise SourceError(
+            f"{angle:g} degrees is narrower than any endoscope sees; if these are radians, write "
+            f"{math.degrees(angle):.4g}, and if not, fx, fy, cx and cy in its place",
+            file=file,
+            field=ANGLE,
+        )
+
+
+def check_complete(content: Mapping[str, Any], file: Path) -> None:
+    """Refuse a pinhole of which something is not stated.
+
+    Raises:
+        SourceError: names what is missing, and the field of view that has another name.
+    """
+    absent = [key for key in PINHOLE_KEYS if key not in content]
+    if not absent:
+        return
+    listed = ", ".join(absent)
+    missing = f"no {listed}"
+    if absent == [*PINHOLE_KEYS]:
+        missing = f"no K, no {ANGLE} and no {listed}"
+        named = next((key for key in content if _NAMED_ANGLE.search(key)), None)
+        if named is not None:
+            missing += f" ({named} is not read: write the horizontal field of view, in degrees, as {ANGLE})"
+    raise SourceError(f"{missing}; {EXPECTED}", file=file, field="K")
 
 
 def _sizes(

@@ -124,6 +124,25 @@ class TestAFieldOfView:
         (tmp_path / "intrinsics.json").write_text(json.dumps(stated))
         np.testing.assert_array_equal(read(tmp_path).K[0], [[71, 0, 112], [0, 71, 58], [0, 0, 1]])
 
+    @pytest.mark.parametrize("name", ["fov", "hfov_deg", "Field_Of_View", "camera_angle_x"])
+    def test_under_another_name_it_is_told_how_it_is_called(self, tmp_path, name) -> None:
+        (tmp_path / "intrinsics.json").write_text(json.dumps({name: 70}))
+        told = rf"no K.*\({name} is not read: write .* in degrees, as field_of_view_deg\); expected K"
+        with pytest.raises(SourceError, match=told):
+            read_intrinsics(tmp_path, WIDTH, HEIGHT)
+
+    @pytest.mark.parametrize("angle", [0.5, 1.2217, 3.1])
+    def test_radians_are_questioned(self, tmp_path, angle) -> None:
+        (tmp_path / "intrinsics.json").write_text(json.dumps({"field_of_view_deg": angle}))
+        with pytest.raises(SourceError, match=f"radians, write {np.degrees(angle):.4g}, and") as refused:
+            read_intrinsics(tmp_path, WIDTH, HEIGHT)
+        assert refused.value.field == "field_of_view_deg"
+        # What numbers of pixels bear out is an angle in degrees.
+        focal_px = WIDTH / 2 / np.tan(np.radians(2) / 2)
+        narrow = {"fx": focal_px, "fy": focal_px, "cx": WIDTH / 2, "cy": HEIGHT / 2, "field_of_view_deg": 2}
+        (tmp_path / "intrinsics.json").write_text(json.dumps(narrow))
+        assert read_intrinsics(tmp_path, WIDTH, HEIGHT)[0, 0] == pytest.approx(focal_px)
+
 
 class TestToldTwice:
     @pytest.mark.parametrize(
