@@ -164,10 +164,11 @@ def reconstruct(
     if result.refined is not None and tried:
         logger.warning(
             "%s: the poses of training frames do not agree with their images; they are corrected by %.2g "
-            "degrees and %.2g units on average (coarse.refine_poses=auto)",
+            "degrees and %.2g %s on average (coarse.refine_poses=auto)",
             sequence.name,
             result.refined.mean_turn_deg,
             result.refined.mean_shift,
+            "mm" if sequence.metric else "units",
         )
     if config.one_sided:
         # Refined poses differ by far too little to change a side.

@@ -285,6 +285,8 @@ def test_poses_are_corrected_where_that_is_called_for(
     assert found.refined is not None
     assert found.refined.mean_turn_deg > 0.3
     assert "do not agree with their images" in caplog.text
+    assert given.metric
+    assert " mm on average" in caplog.text
     caplog.clear()
     left = reconstruction(exact, refine="auto", iterations=300)
     assert left.refined is None
