@@ -20,7 +20,14 @@ from extrags.carried_depth import MEDIAN, CarriedDepth, evenly, relative_error
 from extrags.frame_stacks import stacked
 from extrags.sequence import EndoscopicSequence
 
-__all__ = ["MeasuredDepthError", "as_given", "measured_depth_error", "with_depth_error"]
+__all__ = [
+    "GROSS_ERROR",
+    "MeasuredDepthError",
+    "as_given",
+    "doubts_in_words",
+    "measured_depth_error",
+    "with_depth_error",
+]
 
 _log = logging.getLogger(__name__)
 
@@ -108,13 +115,14 @@ def with_depth_error(
         "is estimated from the images (ingest.depth_error)",
         sequence.name,
         100 * MEDIAN * found.error,
-        _in_words(found.error),
+        doubts_in_words(found.error),
         extra={"topic": "depth and poses", "field": "depth_mm"},
     )
     return _uncertain(sequence, found.of_frame)
 
 
-def _in_words(error: float) -> str:
+def doubts_in_words(error: float) -> str:
+    """What a relative error of depth, from what frames tell of each other's, may come from."""
     own = f"as if each were off by {100 * error:.1f} % in its own way"
     if error < GROSS_ERROR:
         return own

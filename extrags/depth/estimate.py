@@ -104,6 +104,7 @@ class DepthEstimate(Storable):
             f"expected error {100 * self.report['median_expected_error']:.1f} % in the median{before}; "
             f"{self.report['n_points']} points, {self.report['agreeing_share']:.0%} of pixels confirmed by "
             "other frames"
+            + "".join(f"; {words}" for words in (self.report.get("contradiction", ""),) if words)
         )
 
     def save(self, path: Path) -> None:
@@ -170,7 +171,7 @@ def estimate_depth(
     if len(sequence) < 2:
         raise CaptureError(f"{sequence.name}: depth from other frames needs at least two, found one")
     poses = PROFILES[DEFAULT_PROFILE].poses if poses is None else poses
-    points, points_rgb, origin = _points(sequence, config, poses)
+    points, points_rgb, origin, told_of_poses = _points(sequence, config, poses)
     small = _with_masks(sequence.at_most_width(config.max_width))
     near, typical, far = _ranges(small, points, config)
     frames = posed_frames(small, device)
@@ -210,6 +211,7 @@ def estimate_depth(
         **depth_report(stereo, frames.mask, config.completion),
         "device": device.type,
         "median_expected_error": _median_error(expected, sequence.mask),
+        **told_of_poses,
     }
     return DepthEstimate(depth, expected, points.astype(np.float64), points_rgb, report)
 
@@ -334,20 +336,23 @@ def posed_frames(sequence: EndoscopicSequence, device: torch.device | str = "cpu
 
 def _points(
     sequence: EndoscopicSequence, config: DepthConfig, poses: PosesConfig
-) -> tuple[np.ndarray, np.ndarray, str]:
-    """Sparse points, their colours, and where they come from."""
+) -> tuple[np.ndarray, np.ndarray, str, dict[str, str]]:
+    """Sparse points, their colours, where they come from, and what they tell against the poses."""
+    told: dict[str, str] = {}
     if sequence.points is not None and len(sequence.points) >= MIN_POINTS:
         rgb = sequence.points_rgb
         rgb = np.full((len(sequence.points), 3), 128, np.uint8) if rgb is None else rgb
-        return sequence.points, rgb, "the source or the poses stage"
+        return sequence.points, rgb, "the source or the poses stage", told
     if config.triangulate:
         found = triangulate_points(sequence, poses)
+        # On the page too: of poses that are wrong nothing else there tells but its figures.
+        told = {name: words for name, words in found.report.items() if name == "contradiction"}
         if len(found) >= MIN_POINTS:
-            return found.points, found.points_rgb, "triangulation with the given poses"
+            return found.points, found.points_rgb, "triangulation with the given poses", told
     _LOG.warning(
         "%s: no points to tell the range of depths; it is guessed from the cameras' motion", sequence.name
     )
-    return np.zeros((0, 3)), np.zeros((0, 3), np.uint8), "none"
+    return np.zeros((0, 3)), np.zeros((0, 3), np.uint8), "none", told
 
 
 def _ranges(

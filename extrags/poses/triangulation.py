@@ -43,7 +43,8 @@ class Triangulation:
         observed_frame: frame of each observation, an index into the sequence, [O].
         observed_point: index into `points`, [O].
         observed_px: where in the image, in pixels, centres at +0.5, [O, 2].
-        report: counts of features, pairs and matches, ready for JSON.
+        report: counts of features, pairs and matches, ready for JSON; `contradiction` says in words that
+            they show the poses to be wrong.
     """
 
     points: Float[np.ndarray, "p 3"]
@@ -105,8 +106,11 @@ def triangulate_points(
     result = run_job(module, _job(seen, config), sequence.name, stage=stage)
     larger = np.array([sequence.width / seen.width, sequence.height / seen.height])
     found = _assessed(sequence, replace(result, observed_px=result.observed_px * larger))
-    _tell_of_wrong_poses(sequence.name, found, float(larger[0]))
-    return found
+    contradiction = _contradiction(found, float(larger[0]))
+    if not contradiction:
+        return found
+    _LOG.warning("%s: %s", sequence.name, contradiction)
+    return replace(found, report=found.report | {"contradiction": contradiction})
 
 
 def _job(sequence: EndoscopicSequence, config: PosesConfig) -> PoseJob:
@@ -152,26 +156,23 @@ def _assessed(sequence: EndoscopicSequence, result: PoseJobResult) -> Triangulat
     return found
 
 
-def _tell_of_wrong_poses(name: str, found: Triangulation, larger: float) -> None:
-    """Warn where features say that poses are wrong, and not only inexact.
+def _contradiction(found: Triangulation, larger: float) -> str:
+    """That features say poses are wrong, and not only inexact; empty where they do not.
 
     Args:
-        name: of the sequence.
         found: what its poses explain.
         larger: how many times as wide its frames are as those in which features were looked for.
     """
     matches = found.report.get("matches", 0)
     if matches < FEWEST_MATCHES or found.report["matches_kept"] >= CONTRADICTED_SHARE * matches:
-        return
+        return ""
     if len(found) and np.median(found.reprojection_px) <= CONTRADICTED_PX * larger:
-        return
-    _LOG.warning(
-        "%s: the poses explain %.0f %% of %d feature matches between training frames: they are probably in "
-        "other axes, inverted or those of other frames, or K is wrong; `extrags data check` says which, "
-        "where frames tell",
-        name,
-        100 * found.report["matches_kept"] / matches,
-        matches,
+        return ""
+    share = 100 * found.report["matches_kept"] / matches
+    return (
+        f"the poses explain {share:.0f} % of {matches} feature matches between training frames: they are "
+        "probably in other axes, inverted or those of other frames, or K is wrong; `extrags data check` says "
+        "which, where frames tell"
     )
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from extrags.config import ReportConfig
+from extrags.measured_depth import GROSS_ERROR, doubts_in_words
 from extrags.report.charts import gain_chart, history_chart, views_chart
 from extrags.report.downloads import file_name
 from extrags.report.estimated_depth import estimated_depth
@@ -84,6 +85,7 @@ def build_pages(inputs: ReportInputs, config: ReportConfig) -> tuple[str, str]:
         files=file_name(inputs.name),
         profile=inputs.profile,
         summary=summary(inputs),
+        warnings=_warnings(inputs),
         tiles=tiles(inputs),
         regions=regions(inputs),
         surface=surface_rows(inputs),
@@ -116,6 +118,18 @@ def build_pages(inputs: ReportInputs, config: ReportConfig) -> tuple[str, str]:
         for shown in (inputs, replace(inputs, made="", stages=[], environment={}))
     ]
     return pages[0], pages[1]
+
+
+def _warnings(inputs: ReportInputs) -> list[str]:
+    """What makes all figures doubtful: poses that frames contradict grossly, as the log says it."""
+    report = {} if inputs.depth is None else inputs.depth.report
+    found = [str(report["contradiction"])] if report.get("contradiction") else []
+    error = report.get("median_measured_error", 0.0)
+    # An error that was given is not what frames tell.
+    told_by_frames = inputs.config is None or inputs.config.ingest.depth_error == "auto"
+    if error >= GROSS_ERROR and told_by_frames:
+        found.append(f"training frames disagree about their depth, {doubts_in_words(error)}")
+    return [f"{words[:1].upper()}{words[1:]}." for words in found]
 
 
 def _views(inputs: ReportInputs, config: ReportConfig) -> dict[str, Any]:

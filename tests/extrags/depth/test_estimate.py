@@ -140,6 +140,24 @@ def test_without_any_points_the_cameras_tell_the_range(caplog: pytest.LogCapture
     assert (found.depth[part.mask] > 0).all()
 
 
+def test_what_features_tell_against_the_poses_stays_with_the_depth(
+    withheld: EndoscopicSequence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from extrags.poses import triangulation
+
+    training = withheld.training_part().at_most_width(32)
+    told = "the poses explain 34 % of 900 feature matches"
+
+    def contradicted(sequence: EndoscopicSequence, _: object) -> triangulation.Triangulation:
+        found = triangulation._assessed(sequence, triangulation._no_points(sequence))
+        return replace(found, report={**found.report, "contradiction": told})
+
+    monkeypatch.setattr(depth_estimate, "triangulate_points", contradicted)
+    found = estimate_depth(replace(training, points=None, points_rgb=None), DepthConfig(**SETTINGS))
+    assert found.report["contradiction"] == told
+    assert found.summary.endswith(f"confirmed by other frames; {told}")
+
+
 def test_wide_frames_are_matched_small(withheld: EndoscopicSequence) -> None:
     part = withheld.training_part()
     small = replace(part.at_most_width(48), split=part.split)

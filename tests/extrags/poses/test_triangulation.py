@@ -14,7 +14,7 @@ from extrags.events import Event, Progress, subscribed
 from extrags.poses import Triangulation, triangulate_points
 from extrags.poses.colmap_triangulation import _fundamental, _sampson_px
 from extrags.poses.pairs import neighbouring_pairs
-from extrags.poses.triangulation import _tell_of_wrong_poses
+from extrags.poses.triangulation import _contradiction, _no_points
 from extrags.sequence import EndoscopicSequence
 from tests.extrags.poses.textured_room import HALF_SIZE_MM, room_sequence
 
@@ -111,19 +111,24 @@ def test_without_texture_or_motion_there_are_no_points(sequence: EndoscopicSeque
 
 
 def test_poses_that_features_contradict_are_told(
-    found: tuple[Triangulation, list[Event]], caplog: pytest.LogCaptureFixture
+    sequence: EndoscopicSequence,
+    found: tuple[Triangulation, list[Event]],
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A run went on with poses in other axes, and only `data check` had a word for it."""
     right = found[0]
-    _tell_of_wrong_poses("room", right, 1.0)
+    assert _contradiction(right, 1.0) == ""
     few = replace(right, report={**right.report, "matches": 33790, "matches_kept": 13992})
-    _tell_of_wrong_poses("room", few, 1.0)
-    assert not caplog.messages
+    assert _contradiction(few, 1.0) == ""
     wrong = replace(few, reprojection_px=np.full(len(few), 1.3))
-    _tell_of_wrong_poses("room", wrong, 2.0)
-    assert not caplog.messages
-    _tell_of_wrong_poses("room", wrong, 1.0)
-    assert "the poses explain 41 % of 33790 feature matches between training frames" in caplog.text
+    assert _contradiction(wrong, 2.0) == ""
+    told = _contradiction(wrong, 1.0)
+    assert "the poses explain 41 % of 33790 feature matches between training frames" in told
+    monkeypatch.setattr("extrags.poses.triangulation._assessed", lambda *_: wrong)
+    monkeypatch.setattr("extrags.poses.triangulation.run_job", lambda *_, **__: _no_points(sequence))
+    assert triangulate_points(sequence, CONFIG).report["contradiction"] == told
+    assert told in caplog.text
 
 
 def test_poses_are_needed(sequence: EndoscopicSequence) -> None:

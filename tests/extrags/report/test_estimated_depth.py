@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from extrags.config import ReportConfig
+from extrags.config import PROFILES, PipelineConfig, ReportConfig
 from extrags.errors import ShapeError
 from extrags.measured_depth import with_depth_error
 from extrags.report import ReportInputs, build_report
@@ -89,6 +89,24 @@ def test_no_relation_of_brightness_and_no_network(sequence: EndoscopicSequence, 
     text = Page(build_report(inputs, CONFIG)).text
     assert "Shading, recording 2 no relation of brightness and distance" in text
     assert "a network trained" not in text
+
+
+def test_gross_doubts_of_the_poses_are_on_the_page(sequence: EndoscopicSequence, estimate: Estimate) -> None:
+    """They were in the log alone, and the page had nothing but poor figures."""
+
+    def text(config: PipelineConfig | None = None, **told: Any) -> str:
+        found = replace(estimate, report={**estimate.report, **told})
+        inputs = ReportInputs(name="tube", sequence=sequence, depth=found, config=config)
+        return Page(build_report(inputs, CONFIG)).text
+
+    assert "Warning:" not in text(combined_with_measured=True, median_measured_error=0.04)
+    told = "the poses explain 34 % of 900 feature matches"
+    assert "Warning: The poses explain 34 % of 900 feature matches." in text(contradiction=told)
+    off = {"combined_with_measured": True, "median_measured_error": 0.2}
+    said = "Warning: Training frames disagree about their depth, as if each were off by 20.0 % in its own way"
+    assert f"{said}, or as if poses were wrong" in text(**off)
+    given = PROFILES["quick"].with_overrides({"ingest.depth_error": 0.2})
+    assert "Warning:" not in text(given, **off)
 
 
 def test_a_monocular_network_is_told(sequence: EndoscopicSequence, estimate: Estimate) -> None:
