@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from extrags.errors import SourceError, SourceNotFoundError
-from extrags.frame_names import natural_key
+from extrags.frame_names import COLOR_SUFFIXES, natural_key
 
 __all__ = [
     "FilesBeside",
@@ -127,19 +127,44 @@ def present_frames(files: Mapping[str, Path], max_absent_share: float, *, listin
     if not present or len(absent) > max_absent_share * len(files):
         raise SourceNotFoundError(
             f"{listing.name} lists {len(files)} frames, and {len(absent)} of them are absent, this one "
-            f"first; at most {max_absent_share:.0%} may be (ingest.max_absent_share)",
+            f"first; at most {max_absent_share:.0%} may be (ingest.max_absent_share)"
+            f"{_of_other_suffix(files, absent, listing)}",
             file=files[absent[0]],
             frame=absent[0],
             field="file",
         )
     logger.warning(
-        "%s lists %d frames; %d of them are absent and left out: %s",
+        "%s lists %d frames; %d of them are absent and left out: %s%s",
         listing,
         len(files),
         len(absent),
         _named(absent),
+        _of_other_suffix(files, absent, listing),
     )
     return present
+
+
+def _of_other_suffix(files: Mapping[str, Path], absent: Sequence[str], listing: Path) -> str:
+    """That images which are absent are there as files of another kind; empty where they are not.
+
+    They are not taken: what else has a frame's name may be its mask or a preview, and a lens is that of the
+    size it was calibrated with.
+    """
+    folders: dict[Path, FilesBeside] = {}
+    found = []
+    for name in absent:
+        folder = files[name].parent
+        beside = folders.setdefault(folder, FilesBeside(folder))
+        other = beside.find([files[name].stem], COLOR_SUFFIXES)
+        if other is not None:
+            found.append((name, other))
+    if not found:
+        return ""
+    name, other = found[0]
+    return (
+        f"; {len(found)} of the absent ones are there with another suffix, {other.name} for "
+        f"{Path(name).name} first: if these are the images, let their names and those in {listing.name} agree"
+    )
 
 
 def warn_of_unmasked(folder: Path, masks: Mapping[str, Path | None]) -> None:

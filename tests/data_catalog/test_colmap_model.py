@@ -200,6 +200,26 @@ class TestReading:
         with pytest.raises(SourceError, match=r"of them are absent"):
             read(workspace / place)
 
+    def test_images_of_another_suffix_are_told(self, clip, tmp_path, caplog) -> None:
+        """As of frames that were converted after the model was made; a mask may be called so as well."""
+        write_colmap(clip, tmp_path / "scene", binary=False)
+        files = sorted((tmp_path / "scene" / "images").glob("*.png"))
+        for number, file in enumerate(files):
+            if number in (2, 3):
+                file.unlink()
+            if number > 2:
+                Image.new("RGB", (8, 8)).save(file.with_suffix(".JPG"))
+        assert len(read(tmp_path / "scene")) == len(files) - 2
+        told = f"1 of the absent ones are there with another suffix, {files[3].stem}.JPG for {files[3].name}"
+        assert told in caplog.text
+        for file in files:
+            file.unlink(missing_ok=True)
+        told = (
+            rf"10 of them are absent.*; 7 of the absent .* {files[3].stem}.JPG for {files[3].name} first: if"
+        )
+        with pytest.raises(SourceError, match=told):
+            read(tmp_path / "scene")
+
     def test_recordings_are_folders(self, clip, tmp_path) -> None:
         two = replace(clip, recording=np.repeat([0, 1], 5))
         write_colmap(two, tmp_path / "scene")
