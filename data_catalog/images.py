@@ -311,7 +311,8 @@ def save_images(sequence: EndoscopicSequence, folder: Path) -> list[str]:
     Args:
         sequence: frames of several recordings go to folders of their own, unless their names say folders.
         folder: gets `images/NAME.png`, and `masks/NAME.png.png` (COLMAP's naming; white is tissue) where a
-            mask leaves anything out.
+            mask leaves anything out. Outside the mask images are black: what is burnt in there, as a
+            patient's name, must not leave with files that are made to be passed on.
 
     Returns:
         The names of the images below `images/`, one per frame.
@@ -328,7 +329,8 @@ def save_images(sequence: EndoscopicSequence, folder: Path) -> list[str]:
         names.append(f"{name}.png")
     masked = not sequence.mask.all()
     for index, name in enumerate(names):
-        places = [(folder / "images" / name, Image.fromarray(sequence.rgb[index]))]
+        shown = np.where(sequence.mask[index][..., None], sequence.rgb[index], 0).astype(np.uint8)
+        places = [(folder / "images" / name, Image.fromarray(shown))]
         if masked:
             white = (sequence.mask[index] * 255).astype(np.uint8)
             places.append((folder / "masks" / f"{name}.png", Image.fromarray(white)))

@@ -238,5 +238,7 @@ def _sequence(given: argparse.Namespace) -> int:
     except OSError as error:
         raise StoreError(f"{target} cannot be written: {reason_of(error)}") from error
     count = 0 if points is None else len(points)
-    print(f"{target}: {counted(len(sequence.split.frames), 'frame')} with poses, {counted(count, 'point')}")
+    frames = counted(len(sequence.split.frames), "frame")
+    masked = "" if sequence.mask.all() else "; images are black outside the masks"
+    print(f"{target}: {frames} with poses, {counted(count, 'point')}{masked}")
     return 0

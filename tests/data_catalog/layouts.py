@@ -62,9 +62,9 @@ def carried_error_mm(sequence: EndoscopicSequence) -> float:
 
 
 def same_frames(first: EndoscopicSequence, second: EndoscopicSequence, *, atol: float) -> None:
-    """Everything an exporter promises to keep."""
-    np.testing.assert_array_equal(first.rgb, second.rgb)
+    """Everything an exporter promises to keep: of images what the mask shows."""
     np.testing.assert_array_equal(first.mask, second.mask)
+    np.testing.assert_array_equal(first.rgb[first.mask], second.rgb[second.mask])
     np.testing.assert_allclose(first.K, second.K, rtol=0, atol=atol)
     np.testing.assert_allclose(
         first.cameras.world_from_camera, second.cameras.world_from_camera, rtol=0, atol=atol

@@ -18,6 +18,7 @@ from PIL import Image
 from data_catalog.catalog import read, resolve, source_fingerprint
 from data_catalog.readers.colmap_files import ColmapImage, ColmapModel, read_model, write_model
 from data_catalog.readers.colmap_model import model_folder, points_of, read_depth_map, write_colmap
+from data_catalog.readers.transforms_json import write_transforms
 from extrags.config import IngestConfig
 from extrags.errors import SourceError
 from extrags.lens import Lens, Undistortion
@@ -174,7 +175,6 @@ class TestReading:
             cv2.imwrite(str(beside / file.name), 255 - image)
         back = read(tmp_path / "scene")
         same_frames(back, varied, atol=ROUNDING)
-        np.testing.assert_array_equal(back.rgb, varied.rgb)
         np.testing.assert_array_equal(back.mask, varied.mask)
         np.testing.assert_array_equal(back.depth_mm, varied.depth_mm)
 
@@ -199,6 +199,25 @@ class TestReading:
         shutil.rmtree(workspace / "images")
         with pytest.raises(SourceError, match=r"of them are absent"):
             read(workspace / place)
+
+    def test_what_is_burnt_in_beside_the_picture_is_not_handed_on(self, clip, tmp_path) -> None:
+        """As a patient's name in the dark surround, which the mask leaves out."""
+        mask = clip.mask.copy()
+        mask[:, :20, :40] = False
+        rgb = clip.rgb.copy()
+        rgb[:, 4:12, 4:36] = 255
+        written = replace(clip, rgb=rgb, mask=mask)
+        write_colmap(written, tmp_path / "colmap")
+        write_transforms(written, tmp_path / "transforms")
+        for folder in ("colmap", "transforms"):
+            images = sorted((tmp_path / folder / "images").glob("*.png"))
+            assert len(images) == len(clip)
+            for index, file in enumerate(images):
+                found = np.asarray(Image.open(file))
+                assert not found[~mask[index]].any()
+                np.testing.assert_array_equal(found[mask[index]], rgb[index][mask[index]])
+                seen = np.asarray(Image.open(tmp_path / folder / "masks" / f"{file.name}.png"))
+                np.testing.assert_array_equal(seen > 0, mask[index])
 
     def test_images_of_another_suffix_are_told(self, clip, tmp_path, caplog) -> None:
         """As of frames that were converted after the model was made; a mask may be called so as well."""
