@@ -326,8 +326,9 @@ class CostModel:
 
         Returns:
             A factor for every task of the model: the median of its own records, drawn towards that of all
-            tasks (weighted by time) where they are few. Of tasks with settings beyond the fit, that of
-            their own records; left out where there are none. Empty without any record that fits the model.
+            tasks (weighted by time) where they are few; of these `tells_pace` says which count. Of tasks with
+            settings beyond the fit, that of their own records; left out where there are none. Empty without
+            any record that fits the model.
         """
         beyond = {task: () if config is None else beyond_the_fit(task, config) for task in self.time}
         ratios: dict[str, list[float]] = {}
@@ -338,7 +339,7 @@ class CostModel:
             usual, own_beyond = self.predict(cost.task, work).seconds, beyond_the_fit(cost.task, work.config)
             if usual > 0 and own_beyond == beyond[cost.task]:
                 ratios.setdefault(cost.task, []).append(math.log(cost.seconds / usual))
-            if usual > 0 and not own_beyond:
+            if usual > 0 and not own_beyond and tells_pace(work, cost):
                 taken, expected = taken + cost.seconds, expected + usual
         if not expected:
             return {}
@@ -362,6 +363,14 @@ class CostModel:
     def from_json(found: Mapping[str, Any]) -> CostModel:
         """A model from the JSON of `to_json`."""
         return CostModel(found["time"], found["memory"], float(found["probe_s"]))
+
+
+def tells_pace(work: Workload, cost: TaskCost) -> bool:
+    """Whether a record says how fast a machine is at other tasks too; reading frames depends on their files.
+
+    Of a long video all frames are decoded and few are used, which made everything take four times as long.
+    """
+    return cost.task != "ingest" or work.drawn
 
 
 def stage_tasks(stage: str, config: PipelineConfig) -> tuple[str, ...]:

@@ -20,6 +20,9 @@ MEASURED_SCENES = 2
 SEVERAL_LOOPS = frozenset(task.name for task in all_tasks() if task.several_loops)
 """Tasks that count one thing after another: no count tells how far they are, only their time does."""
 
+READING: StageName = "ingest"
+"""How long it takes depends on the files, and says nothing of other stages."""
+
 USUAL_PACE_SECONDS = 10.0
 """The usual pace weighs as much as so many expected seconds that have run."""
 USED_SHARE = 0.8
@@ -146,16 +149,33 @@ class SequenceEstimate:
         """At the pace of what ran here, and the usual one as long as that is little."""
         waiting = [stage for stage in self._stages() if stage not in self.ended and stage != self.stage]
         rest = sum(self._seconds(stage) for stage in waiting)
-        if self.stage:
+        reading = 0.0
+        if self.stage == READING:
+            reading = self._reading_pace() * (self._seconds(self.stage) - self._stage_done(now))
+        elif self.stage:
             rest += self._seconds(self.stage) - self._stage_done(now)
-        return self._pace(counted=True) * rest
+        return self._pace(counted=True) * rest + reading
+
+    def _reading_pace(self) -> float:
+        """Seconds per expected second of the frames that have been read."""
+        if self._counted is None:
+            return self._pace(counted=False)
+        share, _, at = self._counted
+        expected = self._before_task() + share * self._tasks(self.stage).get(self._task, 0.0)
+        took = USUAL_PACE_SECONDS * usual_pace() + at - self._begun
+        return took / (USUAL_PACE_SECONDS + expected)
 
     def _pace(self, *, counted: bool) -> float:
         """Seconds per expected second, of the stages that ran and of the steps of the one in work."""
-        ran = [row for row in self.ended.values() if row.state == "ran" and row.stage in self._stages()]
+        # Of a long video all frames are decoded and few are used: the stages to come are no slower for it.
+        ran = [
+            row
+            for row in self.ended.values()
+            if row.state == "ran" and row.stage in self._stages() and row.stage != READING
+        ]
         expected = USUAL_PACE_SECONDS + sum(self._seconds(row.stage) for row in ran)
         took = USUAL_PACE_SECONDS * usual_pace() + sum(row.seconds for row in ran)
-        if counted and self._counted is not None:
+        if counted and self._counted is not None and self.stage != READING:
             share, _, at = self._counted
             expected += self._before_task() + share * self._tasks(self.stage).get(self._task, 0.0)
             took += at - self._begun

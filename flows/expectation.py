@@ -165,7 +165,10 @@ def _pace(records: Sequence[OutcomeRecord]) -> float | None:
     paces = []
     for record in records:
         rows = [
-            row for row in record["stages"] if row["state"] in ("ran", "cached") and row.get("expected_cpu_s")
+            row
+            for row in record["stages"]
+            # How long reading takes says nothing of other stages (`extrags.run_costs.tells_pace`).
+            if row["stage"] != "ingest" and row["state"] in ("ran", "cached") and row.get("expected_cpu_s")
         ]
         whole = sum(row["expected_cpu_s"] for row in rows)
         if whole:

@@ -67,7 +67,10 @@ def check_memory(
     expected = expected_seconds(config, frames_work(counts, config))
     ahead = set(stages_until(until)[1:]).difference(leave_out, made)
     seconds = sum(sum(expected[stage].values()) for stage in ahead)
-    log.info("%s, and about %s of processor time%s", what, duration_text(seconds), without_kernels_in_words())
+    # What comes after the last stage, as of a plan, is not in it.
+    end = "" if until == STAGES[-1] else f" until {until}"
+    time, slow = duration_text(seconds), without_kernels_in_words()
+    log.info("%s, and about %s of processor time%s%s", what, time, end, slow)
     if limit_gb is None or found.peak_gb <= limit_gb:
         return found
     settings = fitting_settings(

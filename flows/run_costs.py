@@ -18,6 +18,7 @@ from extrags.run_costs import (
     probe_seconds,
     probed_rasteriser,
     stage_tasks,
+    tells_pace,
 )
 from extrags.scene_plan import ScenePlan
 from extrags.stages import REGISTRY, STAGES, StageName, cost_of, modelled_tasks
@@ -139,7 +140,7 @@ def pace_here(store: Store, fallback: PipelineConfig, model: CostModel) -> Pace:
     fallback = _on_devices(fallback)
     elapsed, processor = recorded_costs(store, fallback)
     known = model.pace(processor, fallback)
-    if known and sum(cost.seconds for _, cost in processor) >= ENOUGH_SECONDS:
+    if known and sum(cost.seconds for work, cost in processor if tells_pace(work, cost)) >= ENOUGH_SECONDS:
         return Pace("history", len(processor), known, model.pace(elapsed, fallback))
     factor = probe_seconds() / model.probe_s
     fitted = [task for task in model.time if not beyond_the_fit(task, fallback)]

@@ -288,6 +288,17 @@ class TestPace:
         assert pace["coarse"] == pytest.approx(2)
         assert pace["ingest"] == pytest.approx(2)
 
+    def test_reading_says_nothing_of_other_tasks(self) -> None:
+        """Of a long video all frames are decoded: `plan --before` told four times as much afterwards."""
+        read = [(work(), TaskCost("ingest", 50.0, None))]
+        assert self.model.pace(read) == {}
+        pace = self.model.pace([*read, (work(), TaskCost("coarse", 20.0, None))])
+        assert pace["coarse"] == pytest.approx(2)
+        assert pace["ingest"] > 2
+        # A procedural scene is drawn by the same processor.
+        drawn = [(replace(work(), drawn=True), TaskCost("ingest", 50.0, None))]
+        assert self.model.pace(drawn)["coarse"] == pytest.approx(10)
+
     def test_a_task_of_its_own_pace(self) -> None:
         records = [(work(), TaskCost("coarse", 10.0, None))] * 50 + [
             (work(), TaskCost("ingest", 15.0, None))

@@ -31,6 +31,10 @@ def test_the_estimate_is_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
         check_memory("a/b", profile_config("balanced"), COUNTS, None, "report", ())
     assert "a/b: 40 frames of 675 x 540 px take at most about" in caplog.text
     assert re.search(r", and about \d+ min of processor time\n$", caplog.text)
+    with caplog.at_level(logging.INFO, logger="flows.memory_limit"):
+        check_memory("a/b", profile_config("balanced"), COUNTS, None, "assess", ())
+    # A plan says beside it what the whole run takes.
+    assert re.search(r", and about \d+ (min|s) of processor time until assess\n$", caplog.text)
 
 
 def test_the_time_is_said_to_be_that_of_the_kernels_where_these_are_missing(
