@@ -323,7 +323,8 @@ def save_images(sequence: EndoscopicSequence, folder: Path) -> list[str]:
     from PIL import Image
 
     names = []
-    for index, name in enumerate(names_in_folders(sequence)):
+    told = [sequence.frame_name(index) for index in range(len(sequence))]
+    for index, name in enumerate(names_in_folders(told, sequence.recording, sequence.split.frames)):
         # Names come from sources; nothing is written beside the folder.
         inside(folder / "images", f"{name}.png", file=folder, frame=index, field="name")
         names.append(f"{name}.png")

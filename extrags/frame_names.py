@@ -16,12 +16,10 @@ from decimal import Decimal
 from itertools import groupby, pairwise
 from math import gcd
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
-
-if TYPE_CHECKING:
-    from extrags.sequence import EndoscopicSequence
+from jaxtyping import Int
 
 __all__ = [
     "COLOR_SUFFIXES",
@@ -394,16 +392,22 @@ def tell_about_order(place: Path, order: NameOrder) -> None:
         )
 
 
-def names_in_folders(sequence: EndoscopicSequence) -> list[str]:
-    """Names of all frames as exporters write them: those of several recordings in folders of their own.
+def names_in_folders(
+    names: Sequence[str], recording: Int[np.ndarray, "f"] | None, used: Int[np.ndarray, "m"]
+) -> list[str]:
+    """Names of frames as exporters write them: those of several recordings in folders of their own.
 
-    `recording_N/NAME`, unless the name says a folder. Recordings of which no frame is in either part of the
-    split do not count, since exporters leave them out.
+    Args:
+        names: of all frames.
+        recording: the index of each frame's recording; None where there is one.
+        used: frames of either part of the split; exporters leave out the others, which do not make a
+            recording of their own.
+
+    Returns:
+        `recording_N/NAME`, unless the name says a folder or all frames are of one recording.
     """
-    names = [sequence.frame_name(index) for index in range(len(sequence))]
-    recording = sequence.recording
-    if recording is None or len(np.unique(recording[sequence.split.frames])) < 2:
-        return names
+    if recording is None or len(np.unique(recording[used])) < 2:
+        return list(names)
     return [
         name if "/" in name else f"recording_{int(number)}/{name}"
         for name, number in zip(names, recording, strict=True)

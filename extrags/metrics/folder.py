@@ -102,7 +102,8 @@ def _files_of(
     """One file per held-out frame, in their order."""
     if not folder.is_dir():
         raise SourceNotFoundError(f"there is no such folder of {kind}s", file=folder)
-    placed = names_in_folders(sequence)
+    frames = [sequence.frame_name(frame) for frame in range(len(sequence))]
+    placed = names_in_folders(frames, sequence.recording, sequence.split.frames)
     paths = [_bare(placed[int(frame)]) for frame in sequence.test]
     in_folders = _files_at(paths, folder, suffixes)
     if in_folders:
@@ -112,7 +113,6 @@ def _files_of(
         kinds = ", ".join(sorted(suffixes))
         raise SourceNotFoundError(f"the folder holds no {kind} ({kinds})", file=folder)
     wanted = [_stem(path) for path in paths]
-    frames = [sequence.frame_name(frame) for frame in range(len(sequence))]
     every = {_stem(_bare(name)) for name in (*frames, *not_measured)}
     by_stem = _by_name({file: file.stem for file in files}, kind)
     named = [stem for stem in by_stem if stem in every]
