@@ -21,7 +21,7 @@ from data_catalog.ct_colon.dataset import CT_COLON
 from data_catalog.dataset import Dataset, Descriptor, Source, file_digests
 from data_catalog.detail import DetailSize, source_detail
 from data_catalog.folder_reader import Glance
-from data_catalog.folders import FolderDataset, find_reader
+from data_catalog.folders import FolderDataset, find_reader, readers
 from data_catalog.footage import DICOM_SUFFIXES, VIDEO_SUFFIXES
 from data_catalog.phantom.dataset import PHANTOM
 from data_catalog.pose_conventions import OPENCV
@@ -40,6 +40,8 @@ __all__ = [
     "DATASETS",
     "describe",
     "drawn_formats",
+    "footage_formats",
+    "footage_glance",
     "glance",
     "list_sequences",
     "measured_detail",
@@ -113,6 +115,30 @@ def resolve(name_or_path: str | Path) -> Source:
 def drawn_formats() -> frozenset[str]:
     """Formats of sequences whose frames are drawn when they are asked for (`Source.format`)."""
     return frozenset(dataset.name for dataset in DATASETS if isinstance(dataset, RenderedDataset))
+
+
+def footage_formats() -> frozenset[str]:
+    """Formats of videos and DICOM files, of which frames are chosen (`Source.format`)."""
+    return frozenset(reader.name for reader in readers() if reader.is_footage)
+
+
+def footage_glance(source: Source, config: IngestConfig) -> Glance | None:
+    """What the header of a video or a DICOM file tells (`glance`).
+
+    Args:
+        source: what `resolve` returns.
+        config: settings that it is read with.
+
+    Returns:
+        None for other sources, and where the reader would have to decode all of it.
+
+    Raises:
+        SourceError: as `read` does.
+    """
+    reader, dataset = find_reader(source.format), _dataset(source)
+    if reader is None or not reader.is_footage or reader.outline is None:
+        return None
+    return dataset.glance(source, config) if isinstance(dataset, FolderDataset) else None
 
 
 def glance(name_or_path: str | Path, config: IngestConfig | None = None) -> Glance | None:

@@ -33,6 +33,10 @@ class Glance:
         test: number of held-out frames; of footage, at most.
         has_poses: whether the source has camera poses.
         has_depth: whether it has depth.
+        looked_at: of footage, pictures that the frames are chosen among, each of which is decoded twice; 0
+            where the header does not say, and for other sources.
+        passed_over: pictures before the part of footage that is read, decoded twice and not looked at.
+        source_pixels: of a picture of footage, of stereo footage of one view; 0 for other sources.
     """
 
     width: int
@@ -41,6 +45,9 @@ class Glance:
     test: int
     has_poses: bool
     has_depth: bool
+    looked_at: int = 0
+    passed_over: int = 0
+    source_pixels: int = 0
 
 
 class _Unheard(logging.Filter, threading.local):
@@ -179,6 +186,9 @@ class FolderReader:
             test=len(split.test),
             has_poses=world_from_camera is not None,
             has_depth=any(frame.depth_file is not None for frame in kept),
+            looked_at=source.looked_at if self.is_footage else 0,
+            passed_over=source.passed_over,
+            source_pixels=kept[0].lens.width * kept[0].lens.height if self.is_footage else 0,
         )
 
     def fingerprint(self, place: Path) -> dict[str, Any]:

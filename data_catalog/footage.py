@@ -75,6 +75,13 @@ class Footage(Protocol):
     def pixel_aspect(self) -> float:
         """Width of a pixel over its height, of upright frames."""
 
+    def counted_until(self, end_s: float) -> int:
+        """About how many frames are shown before a moment, by the header alone; 0 where it does not say.
+
+        Args:
+            end_s: the moment, in the recording's own time.
+        """
+
     def frames(self, span: TimeSpan, numbers: Collection[int] | None = None) -> Iterator[FootageFrame]:
         """Decode from the beginning.
 

@@ -141,7 +141,9 @@ class SourceFrames:
             all frames have one.
         angle_alone: whether the lenses are made of a stated field of view and nothing else: it belongs to the
             picture inside the frame, as a guessed one does.
-        looked_at: steps of progress that were reported before the first frame is read.
+        looked_at: pictures that the frames were chosen among, each of which was a step of progress before the
+            first frame is read.
+        passed_over: pictures before these, which are decoded and not looked at.
         lens_stays: why no calibration file may take the place of the lenses that are stated, as a sentence;
             None where one may.
         stereo_camera: whose frames these are; None where nothing tells of two cameras.
@@ -170,6 +172,7 @@ class SourceFrames:
     intrinsics: Literal["given", "guessed"] = "given"
     angle_alone: bool = False
     looked_at: int = 0
+    passed_over: int = 0
     lens_stays: str | None = None
     stereo_camera: StereoCamera | None = None
     upright: bool = False

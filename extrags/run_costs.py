@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from extrags.raster.bench import BenchSize
 
 __all__ = [
+    "FOOTAGE_NUMBERS",
     "MEMORY_TERMS",
     "WORKLOAD_SETTINGS",
     "CostModel",
@@ -48,6 +49,8 @@ EVALUATION_TERMS = ("pixels*stacks", "pixels*vgg")
 """Further terms of the memory of what evaluates."""
 HELD_PIXELS = MAPPED_BYTES / 3
 """Of all frames together, at most: the images of more are a mapped file, which the memory does not count."""
+FOOTAGE_NUMBERS = ("looked_at", "passed_over", "source_pixels")
+"""Of `Workload`: what is known of a video or a DICOM file alone."""
 FITTED_BACKEND = "embedded"
 """The only one that there are records of."""
 GAUSSIANS_WANTED = (51_000, 5000, 0.39)
@@ -130,6 +133,9 @@ class Workload:
         final_gaussians: of the final scene, likewise.
         drawn: whether the frames are drawn by a procedural scene, instead of read.
         has_depth: whether the source knows their depth, withheld or not.
+        looked_at: pictures of a video or DICOM file that the frames are chosen among; 0 for other sources.
+        passed_over: pictures before the part that is read.
+        source_pixels: of such a picture.
     """
 
     pixels: float | int
@@ -144,12 +150,16 @@ class Workload:
     final_gaussians: float | int | None = None
     drawn: bool = False
     has_depth: bool = True
+    looked_at: float | int = 0
+    passed_over: float | int = 0
+    source_pixels: float | int = 0
 
     @property
     def size(self) -> dict[str, float]:
         """What the sequence tells: pixels, frames, those for training and held out, width.
 
-        Also `drawn` where they are, and `has_depth` where there is none: earlier records tell of neither.
+        Also `drawn` where they are, `has_depth` where there is none, and what is looked at of footage:
+        earlier records tell of none of these.
         """
         found = {name: float(getattr(self, name)) for name in ("pixels", "frames", "train", "test")}
         if self.width is not None:
@@ -158,6 +168,9 @@ class Workload:
             found["drawn"] = True
         if not self.has_depth:
             found["has_depth"] = False
+        footage = {name: float(getattr(self, name)) for name in FOOTAGE_NUMBERS}
+        if any(footage.values()):
+            found |= footage
         return found
 
     def numbers(self) -> dict[str, float]:
@@ -178,6 +191,11 @@ class Workload:
             "drawn": float(self.drawn),
             # What is read with depth is resampled, and held-out pixels are looked for in training frames.
             "known_depth": float(self.has_depth),
+            # Read from files of their own.
+            "files": float(self.frames) * (not self.drawn and self.source_pixels == 0),
+            "looked_at": float(self.looked_at),
+            "passed_over": float(self.passed_over),
+            "source_pixels": float(self.source_pixels),
             "train": float(self.train),
             "test": float(self.test),
             "iterations": float(config.coarse.iterations),

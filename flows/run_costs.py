@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-from data_catalog.catalog import drawn_formats
+from data_catalog.catalog import drawn_formats, footage_formats
 from extrags.config import PipelineConfig
 from extrags.errors import StoreError
 from extrags.run_costs import (
@@ -24,7 +24,7 @@ from extrags.scene_plan import ScenePlan
 from extrags.stages import REGISTRY, STAGES, StageName, cost_of, modelled_tasks
 from extrags.store import Manifest, Store
 from flows.outcome import SequenceOutcome
-from flows.workloads import frames_stages, frames_work, knows_depth, task_repeats
+from flows.workloads import footage_numbers, frames_stages, frames_work, knows_depth, task_repeats
 
 __all__ = [
     "Pace",
@@ -371,6 +371,9 @@ def _workload(
     size = [counts.get(name) for name in ("width", "height", "frames", "train", "test")]
     if not all(isinstance(value, int | float) for value in size):
         return None
+    if manifest.stage == "ingest" and _format(source) in footage_formats() and "looked_at" not in counts:
+        # Of an earlier version, which did not say how much of the footage was decoded.
+        return None
     width, height, frames, train, test = (float(value or 0) for value in size)
     views = manifest.counts.get("views") if manifest.stage == "enhance" else None
     stacks = manifest.counts.get("stacks")
@@ -390,13 +393,19 @@ def _workload(
         float(final) if final else None,
         drawn=_is_drawn(source),
         has_depth=knows_depth(counts, config),
+        **footage_numbers(counts),
     )
 
 
 def _is_drawn(source: Manifest) -> bool:
     """Whether the frames of an artefact of `ingest` were drawn, not read."""
+    return _format(source) in drawn_formats()
+
+
+def _format(source: Manifest) -> str:
+    """That of what an artefact of `ingest` was made from (`data_catalog.Source.format`); empty if unknown."""
     fingerprint = source.config.get("fingerprint")
-    return isinstance(fingerprint, dict) and fingerprint.get("format") in drawn_formats()
+    return str(fingerprint.get("format", "")) if isinstance(fingerprint, dict) else ""
 
 
 def _ancestors(manifest: Manifest, manifests: Mapping[str, Manifest]) -> list[Manifest]:

@@ -11,13 +11,14 @@ from data_catalog.catalog import drawn_formats
 from extrags.config import PipelineConfig
 from extrags.errors import ExtragsError
 from extrags.pipeline import stages_that_can_run
-from extrags.run_costs import Workload
+from extrags.run_costs import FOOTAGE_NUMBERS, Workload
 from extrags.stages import Repeats, StageName, modelled_tasks
 
 __all__ = [
     "at_detail_size",
     "detail_flags",
     "expected_work",
+    "footage_numbers",
     "frames_stages",
     "frames_work",
     "known_work",
@@ -76,8 +77,24 @@ def frames_work(
         float(counts[name] or 0) for name in ("width", "height", "frames", "train", "test")
     )
     size = width * height, frames, train, test
-    has_depth = knows_depth(counts, config)
-    return Workload(*size, config, width=width, coarse_gaussians=gaussians, drawn=drawn, has_depth=has_depth)
+    return Workload(
+        *size,
+        config,
+        width=width,
+        coarse_gaussians=gaussians,
+        drawn=drawn,
+        has_depth=knows_depth(counts, config),
+        **footage_numbers(counts),
+    )
+
+
+def footage_numbers(counts: Mapping[str, Any]) -> dict[str, float]:
+    """Of `Workload`: how much of a video or DICOM file was looked at; zeros for other sources.
+
+    Args:
+        counts: of the artefact of `ingest`.
+    """
+    return {name: float(counts.get(name) or 0) for name in FOOTAGE_NUMBERS}
 
 
 def knows_depth(counts: Mapping[str, Any], config: PipelineConfig) -> bool:
@@ -160,7 +177,8 @@ def work_before_reading(
     if isinstance(about, Descriptor):
         work = _catalogue_work(about, config)
     else:
-        counts = {name: getattr(about, name) for name in ("width", "height", "train", "test", "has_depth")}
+        told = ("width", "height", "train", "test", "has_depth", *FOOTAGE_NUMBERS)
+        counts = {name: getattr(about, name) for name in told}
         work = frames_work({**counts, "frames": about.train + about.test}, config)
     return work, stages_that_can_run(
         config,

@@ -39,7 +39,7 @@ def ingest(
             artefact would stand under the key of other content.
     """
     from data_catalog import read
-    from data_catalog.catalog import measured_detail, source_fingerprint
+    from data_catalog.catalog import footage_glance, measured_detail, source_fingerprint
     from data_catalog.detail import detail_size
     from extrags.sequence import saturated_mask
 
@@ -52,6 +52,14 @@ def ingest(
         problem = "the files changed while they were read; run again"
         raise SourceError(problem, file=source.path or source.name)
     slot.save(sequence)
+    footage = footage_glance(source, config)
+    if footage is not None:
+        # How long it took cannot be told from the frames that were chosen alone.
+        slot.counts.update(
+            looked_at=footage.looked_at,
+            passed_over=footage.passed_over,
+            source_pixels=footage.source_pixels,
+        )
     detail = asked or detail_size(sequence, config.detail_psnr_db)
     log.info("%s: frames hold %s", sequence.name, detail)
     inside = max(1, int(sequence.mask.sum()))

@@ -24,6 +24,7 @@ import logging
 import struct
 import tempfile
 import weakref
+from bisect import bisect_left
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from importlib.util import find_spec
@@ -136,6 +137,10 @@ class DicomFile:
     def pixel_aspect(self) -> float:
         """Width of a pixel over its height."""
         return self._pixel_aspect
+
+    def counted_until(self, end_s: float) -> int:
+        """How many frames are shown before a moment."""
+        return bisect_left(self._times_s, end_s)
 
     def frames(self, span: TimeSpan, numbers: Collection[int] | None = None) -> Iterator[FootageFrame]:
         """Decode from the beginning; frames that are not asked for are passed over.

@@ -81,24 +81,26 @@ def footage_frames(footage: Footage, config: IngestConfig) -> SourceFrames:
 def footage_outline(footage: Footage, config: IngestConfig) -> SourceFrames:
     """About the frames that `footage_frames` will choose, from the header alone: their pixels are not read.
 
-    There are as many as may be chosen, or as the header announces; fewer will be where the picture hardly
-    moves, where there are cuts, or where a part was asked for.
+    There are as many as may be chosen, or as the header announces of the part that is asked for; fewer will
+    be where the picture hardly moves, or where there are cuts.
 
     Args:
         footage: of one recording.
-        config: number of frames.
+        config: number of frames, and the part in seconds.
 
     Raises:
         ConfigError: a part that ends before it begins.
         SourceError: no frame can be decoded, or intrinsics beside the file are damaged.
     """
-    time_span(config)
+    span = time_span(config)
     if not all(footage.size):
         raise SourceError(NOTHING_DECODED, file=footage.file)
     footage = of_one_camera(footage, config)
     most = config.max_frames or MAX_FRAMES
-    there = footage.announced or most
-    return _unread(footage, config, np.array(spread(there, most)), *footage.size)
+    passed_over = footage.counted_until(span.start_s)
+    looked_at = max(0, footage.counted_until(span.end_s) - passed_over)
+    unread = _unread(footage, config, np.array(spread(looked_at or most, most)), *footage.size)
+    return replace(unread, looked_at=looked_at, passed_over=passed_over)
 
 
 def _unread(

@@ -60,6 +60,10 @@ class OneCamera:
         aspect = self._footage.pixel_aspect
         return aspect if self._views is None else aspect * self._views.pixel_aspect(*self._footage.size)
 
+    def counted_until(self, end_s: float) -> int:
+        """About how many pictures are shown before a moment, by the header; 0 where it does not say."""
+        return self._footage.counted_until(end_s)
+
     def frames(self, span: TimeSpan, numbers: Collection[int] | None = None) -> Iterator[FootageFrame]:
         """Decode from the beginning, the view of one camera alone.
 

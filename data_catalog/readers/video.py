@@ -140,6 +140,11 @@ class VideoFile:
         """Width of a pixel over its height, of upright frames."""
         return self._pixel_aspect
 
+    def counted_until(self, end_s: float) -> int:
+        """About how many frames are shown before a moment, at a steady rate; 0 where the header is silent."""
+        rate = self._frames_per_s or _USUAL_FRAMES_PER_S
+        return round(min(self._announced, max(0.0, end_s) * rate))
+
     def frames(self, span: TimeSpan, numbers: Collection[int] | None = None) -> Iterator[FootageFrame]:
         """Decode from the beginning: between key frames all are needed, so that jumping gains nothing.
 

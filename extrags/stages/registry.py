@@ -32,9 +32,13 @@ REGISTRY: tuple[Stage, ...] = (
                         "one",
                         "frames",
                         "frames*pixels",
-                        "known_depth*frames*pixels",
+                        # Corrections are looked for in a bounded number of pairs of frames.
+                        "known_depth",
+                        "known_depth*files",
                         "known_depth*test*pixels",
                         "drawn*frames*pixels",
+                        "looked_at",
+                        "looked_at*source_pixels",
                     )
                 ),
             ),

@@ -122,7 +122,8 @@ class TestFootage:
     def test_a_short_video(self, tmp_path: Path) -> None:
         file = write_video(tmp_path / "a.avi", moving_scene(12, 160, 90, speed=6))
         found = glance(file, IngestConfig(width=80))
-        assert found == Glance(80, 45, train=10, test=2, has_poses=False, has_depth=False)
+        footage = {"looked_at": 12, "source_pixels": 160 * 90}
+        assert found == Glance(80, 45, train=10, test=2, has_poses=False, has_depth=False, **footage)
         # Of those that hardly move some are left out.
         chosen = read(file, IngestConfig(width=80))
         assert (chosen.width, chosen.height) == (found.width, found.height)
@@ -146,7 +147,25 @@ class TestFootage:
         pytest.importorskip("pydicom")
         file = write_dicom(tmp_path / "a.dcm", moving_scene(8, 160, 96, speed=6))
         found = glance(file)
-        assert found == Glance(160, 96, train=7, test=1, has_poses=False, has_depth=False)
+        footage = {"looked_at": 8, "source_pixels": 160 * 96}
+        assert found == Glance(160, 96, train=7, test=1, has_poses=False, has_depth=False, **footage)
+
+    @pytest.mark.parametrize("kind", ["video", "dicom"])
+    def test_a_part(self, tmp_path: Path, kind: str) -> None:
+        """Frames before it are decoded, and not looked at; 25 a second."""
+        scene = moving_scene(50, 160, 96, speed=6)
+        if kind == "video":
+            file = write_video(tmp_path / "a.avi", scene)
+        else:
+            pytest.importorskip("pydicom")
+            file = write_dicom(tmp_path / "a.dcm", scene, FrameTime=40)
+        found = glance(file, IngestConfig(start_s=0.8, end_s=1.2))
+        assert found is not None
+        assert (found.passed_over, found.looked_at) == (20, 10)
+        assert found.train + found.test == 10
+        whole = glance(file, IngestConfig(start_s=0.8))
+        assert whole is not None
+        assert (whole.passed_over, whole.looked_at) == (20, 30)
 
     def test_no_video(self, tmp_path: Path) -> None:
         (tmp_path / "a.mp4").write_text("hello")

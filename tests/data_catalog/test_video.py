@@ -418,6 +418,9 @@ class TestShots:
             size = (64, 48)
             pixel_aspect = 1.0
 
+            def counted_until(self, end_s: float) -> int:
+                return round(min(self.announced, 25 * end_s))
+
             def frames(self, span: TimeSpan, numbers: Collection[int] | None = None):
                 nonlocal most
                 for number in range(self.announced):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import json
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -20,7 +21,7 @@ from extrags.errors import SourceNotFoundError
 from extrags.raster import native_isa
 from extrags.run_costs import CostModel, Workload, packaged_model
 from extrags.stages import STAGES, modelled_tasks
-from extrags.store import Store
+from extrags.store import MANIFEST, Store
 from flows import run_costs
 from flows.commands.plan import print_prediction
 from flows.methods import METHODS, method_config
@@ -29,6 +30,8 @@ from flows.run_costs import RunPrediction, planned_work, predict_run, recorded_c
 from flows.runners import DirectRunner
 from flows.wiring import run_sequence
 from flows.workloads import expected_work, work_before_reading
+from tests.data_catalog.footage_fixture import write_video
+from tests.data_catalog.test_content import moving_scene
 from tests.flows.tiny import SEQUENCE, TINY
 
 CONFIG: PipelineConfig = profile_config("quick").with_overrides(TINY)
@@ -60,6 +63,26 @@ def test_records_have_the_numbers_that_costs_depend_on(filled: Store) -> None:
     parts = filled.ls("explore*")
     (explore,) = [cost for _, cost in elapsed if cost.task == "explore"]
     assert explore.seconds == pytest.approx(sum(part.elapsed_s for part in parts), abs=0.01)
+
+
+def test_records_of_a_video_say_how_much_of_it_was_looked_at(tmp_path: Path) -> None:
+    file = write_video(tmp_path / "exam.avi", moving_scene(40, 160, 96, speed=6))
+    store = Store(tmp_path / "store")
+    config = CONFIG.with_overrides({"ingest.max_frames": 8, "ingest.width": 80, "ingest.height": None})
+    outcome = run_sequence(str(file), config, store.root, DirectRunner(store.root), until="ingest")
+    assert outcome.status == "ok"
+
+    def of_ingest() -> list[Workload]:
+        return [work for work, cost in recorded_costs(store, CONFIG)[1] if cost.task == "ingest"]
+
+    (work,) = of_ingest()
+    assert (work.looked_at, work.passed_over, work.source_pixels) == (40, 0, 160 * 96)
+    # Earlier versions did not say; reading a video then seems to take many times as long as its frames.
+    (place,) = [path for path in Path(store.root).rglob(MANIFEST) if '"looked_at"' in path.read_text()]
+    manifest = json.loads(place.read_text())
+    del manifest["counts"]["looked_at"]
+    place.write_text(json.dumps(manifest))
+    assert of_ingest() == []
 
 
 def test_the_history_of_a_store_tells_the_pace(filled: Store, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -20,6 +21,8 @@ from flows.workloads import (
     frames_work,
     read_size,
 )
+from tests.data_catalog.footage_fixture import write_video
+from tests.data_catalog.test_content import moving_scene
 
 
 def test_frames_of_the_size_that_keeps_their_detail_cost_less() -> None:
@@ -69,6 +72,58 @@ def test_frames_without_depth_are_read_faster() -> None:
     assert model.predict("ingest", known).seconds > 2 * model.predict("ingest", without).seconds
     for name, expected in (("sinus/hopkins", False), ("simcol3d/s1", True)):
         assert _catalogue_work(describe(name), config).has_depth is expected
+
+
+class TestFootage:
+    """Frames of a video are few, and all of it is decoded."""
+
+    @staticmethod
+    def work(**settings: Any) -> Workload:
+        config = PipelineConfig(ingest=IngestConfig(width=320, max_frames=100))
+        counts = {"width": 320, "height": 180, "frames": 100, "train": 87, "test": 13, "has_depth": 0}
+        return frames_work({**counts, **settings}, config)
+
+    def test_a_long_one_takes_longer_than_its_frames(self) -> None:
+        size = {"source_pixels": 1920 * 1080}
+        files, short, hour = (
+            packaged_model().predict("ingest", self.work(**given)).seconds
+            for given in ({}, {**size, "looked_at": 200}, {**size, "looked_at": 90_000})
+        )
+        assert files < short < 20
+        assert hour > 2000
+
+    def test_what_videos_took(self) -> None:
+        """Processor seconds of `ingest` of four codecs, none of which is in the fit (docs/experiments)."""
+        for width, height, source_px, looked_at, frames, seconds in (
+            (720, 576, 720 * 576, 700, 136, 13.0),
+            (1350, 1080, 1350 * 1080, 250, 59, 14.2),
+            (960, 540, 960 * 540, 900, 100, 11.7),
+            (1920, 1080, 1920 * 1080, 200, 53, 14.7),
+            (320, 180, 1920 * 1080, 200, 53, 5.9),
+            (320, 256, 1350 * 1080, 250, 59, 6.9),
+            (320, 256, 720 * 576, 700, 100, 9.0),
+        ):
+            size = {"width": width, "height": height, "frames": frames}
+            found = self.work(**size, looked_at=looked_at, source_pixels=source_px)
+            assert packaged_model().predict("ingest", found).seconds == pytest.approx(seconds, rel=0.25)
+
+    def test_what_is_passed_over_is_decoded(self) -> None:
+        size = {"source_pixels": 1920 * 1080, "looked_at": 1000}
+        start, late = (self.work(**size, passed_over=frames) for frames in (0, 10_000))
+        model = packaged_model()
+        more = model.predict("ingest", late).seconds - model.predict("ingest", start).seconds
+        assert 50 < more < 200
+
+    def test_records_tell_of_it(self) -> None:
+        found = self.work(looked_at=200, source_pixels=640 * 480)
+        assert Workload(config=found.config, **found.size) == found
+        assert "looked_at" not in self.work().size
+
+    def test_headers_tell_before_it_is_read(self, tmp_path: Path) -> None:
+        file = write_video(tmp_path / "exam.avi", moving_scene(50, 160, 96, speed=6))
+        found = expected_work(str(file), PipelineConfig(ingest=IngestConfig(max_frames=8, width=80)))
+        assert found is not None
+        assert (found.frames, found.looked_at, found.source_pixels) == (8, 50, 160 * 96)
 
 
 def test_only_procedural_scenes_are_drawn() -> None:
