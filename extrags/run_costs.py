@@ -78,6 +78,9 @@ WORKLOAD_SETTINGS = (
     "coarse.pixels_per_point",
     "coarse.densify.enabled",
     "coarse.densify.max_gaussians",
+    "coarse.light.enabled",
+    "coarse.light.frame_colors",
+    "coarse.train_on",
     "depth.hypotheses",
     "depth.max_width",
     "depth.monocular",
@@ -136,6 +139,8 @@ class Workload:
         looked_at: pictures of a video or DICOM file that the frames are chosen among; 0 for other sources.
         passed_over: pictures before the part that is read.
         source_pixels: of such a picture.
+        colors_kept: whether the coarse scene's frames have haze or white balance of their own; where they
+            have none, it begins anew once that is known.
     """
 
     pixels: float | int
@@ -153,6 +158,7 @@ class Workload:
     looked_at: float | int = 0
     passed_over: float | int = 0
     source_pixels: float | int = 0
+    colors_kept: bool = False
 
     @property
     def size(self) -> dict[str, float]:
@@ -198,7 +204,7 @@ class Workload:
             "source_pixels": float(self.source_pixels),
             "train": float(self.train),
             "test": float(self.test),
-            "iterations": float(config.coarse.iterations),
+            "iterations": config.coarse.iterations + (0.0 if self.colors_kept else self._trial_iterations()),
             "gaussians": coarse,
             "coefficients": coarse * (config.coarse.sh_degree + 1) ** 2,
             "final_gaussians": final,
@@ -229,6 +235,11 @@ class Workload:
             "features": self._features() / 1000,
             "pairs": self._matched_pairs(),
         }
+
+    def _trial_iterations(self) -> float:
+        """That the coarse scene begins anew after."""
+        decided = self.config.coarse.color_trial(round(self.train))
+        return 0.0 if decided is None else decided + 1.0
 
     def _gaussians(self) -> tuple[float, float]:
         """Of the coarse and of the final scene."""

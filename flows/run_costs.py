@@ -379,6 +379,7 @@ def _workload(
     stacks = manifest.counts.get("stacks")
     scenes = {item.stage: item.counts.get("n_gaussians") for item in reversed(line)}
     coarse, final = scenes.get("coarse"), scenes.get("finetune")
+    colors_kept = any(item.stage == "coarse" and item.counts.get("corrected_colors") for item in line)
     config = _config(line, fallback)
     return Workload(
         width * height,
@@ -393,6 +394,7 @@ def _workload(
         float(final) if final else None,
         drawn=_is_drawn(source),
         has_depth=knows_depth(counts, config),
+        colors_kept=colors_kept,
         **footage_numbers(counts),
     )
 

@@ -88,7 +88,7 @@ def frames_work(
     )
 
 
-def footage_numbers(counts: Mapping[str, Any]) -> dict[str, float]:
+def footage_numbers(counts: Mapping[str, Any]) -> dict[str, Any]:
     """Of `Workload`: how much of a video or DICOM file was looked at; zeros for other sources.
 
     Args:

@@ -8,10 +8,27 @@ from pydantic import Field, model_validator
 
 from extrags.config.base import Seed, StageConfig
 
-__all__ = ["CoarseConfig", "DensifyConfig", "LightConfig", "OptimiserConfig", "PoseRefinementConfig"]
+__all__ = [
+    "GLARE_TRIAL_SHARE",
+    "CoarseConfig",
+    "DensifyConfig",
+    "LightConfig",
+    "OptimiserConfig",
+    "PoseRefinementConfig",
+]
 
 LEAST_POINTS = 100
 """Starting points that a reconstruction has however few its pixels are."""
+
+GLARE_TRIAL_SHARE = 0.4
+"""Of the iterations, after which it is decided whether there is any glare: it is found early."""
+
+COLOR_TRIAL_SHARE = 0.15
+"""The same for haze and white balance of single frames, where that is enough for so many frames."""
+
+COLOR_TRIAL_UPDATES = 10
+"""Of each frame before it is decided about its haze and white balance: after fewer, what was learned says
+more of their number than of the frames."""
 
 
 class LightConfig(StageConfig):
@@ -264,6 +281,24 @@ class CoarseConfig(StageConfig):
                 f"are corrected from start_share, {refinement.start_share:g}, on"
             )
         return self
+
+    def color_trial(self, frames: int) -> int | None:
+        """How long haze and white balance of single frames are learned before it is decided about them.
+
+        Where there are none, which is usual, the scene begins anew, since the light has fitted itself to
+        them: the iterations until then come on top of all others.
+
+        Args:
+            frames: number of training frames.
+
+        Returns:
+            The iteration after which it is decided; None where they are not learned, as of so many frames
+            that glare, which is learned with them, would have to be decided about before.
+        """
+        if not (self.light.enabled and self.light.frame_colors and self.train_on == "train"):
+            return None
+        decided = max(int(COLOR_TRIAL_SHARE * self.iterations), COLOR_TRIAL_UPDATES * frames)
+        return decided if decided <= int(GLARE_TRIAL_SHARE * self.iterations) else None
 
     def starting_points(self, pixels: int) -> int:
         """How many points a reconstruction starts from at most.

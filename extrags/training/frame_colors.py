@@ -36,8 +36,6 @@ HAZE_KEPT_FROM = 0.1
 """What black shows, from which haze is kept: clear frames learn up to .08."""
 BALANCE_KEPT_FROM = 0.03
 """Root mean square of the logarithms of gains, from which balance is kept: steady ones learn .01 to .02."""
-TRIAL_UPDATES = 10
-"""Of each frame before it is decided: after fewer, the values say more of their number than of the frames."""
 RATES = (0.015, 0.01, 0.01, 0.01)
 """Learning rates of haze and of the logarithms of the gains."""
 BALANCE_PRIOR = 0.1

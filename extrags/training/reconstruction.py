@@ -13,6 +13,7 @@ from jaxtyping import Int
 from extrags.arguments import check_sequence_argument, check_settings_argument
 from extrags.cameras import Cameras
 from extrags.config import DEFAULT_PROFILE, PROFILES, CoarseConfig, DensifyConfig
+from extrags.config.coarse import GLARE_TRIAL_SHARE
 from extrags.errors import CaptureError, ConfigError
 from extrags.facing import with_facing
 from extrags.illumination import NearFieldLight
@@ -21,7 +22,6 @@ from extrags.sequence import EndoscopicSequence
 from extrags.threads import one_torch_thread
 from extrags.training.continuing import EarlierScene, continued_schedule, continued_start
 from extrags.training.footprint import SmallestFootprint
-from extrags.training.frame_colors import TRIAL_UPDATES as COLOR_UPDATES
 from extrags.training.frame_colors import FrameColors, with_corrected_colors
 from extrags.training.frame_weights import weighted_views
 from extrags.training.normal_term import NormalTerm
@@ -41,13 +41,6 @@ __all__ = [
 ]
 
 logger = logging.getLogger(__name__)
-
-GLARE_TRIAL_SHARE = 0.4
-"""Of the iterations, after which it is decided whether there is any: it is found early."""
-
-COLOR_TRIAL_SHARE = 0.15
-"""The same for haze and white balance of single frames, where that is enough for so many frames. Where there
-are none, the scene begins anew, since the light has fitted itself to them."""
 
 
 @one_torch_thread()
@@ -116,13 +109,10 @@ def reconstruct(
     if earlier is not None:
         schedule = continued_schedule(schedule, earlier.iterations)
     else:
-        glare_decided = int(GLARE_TRIAL_SHARE * schedule.iterations)
-        colors_decided = max(int(COLOR_TRIAL_SHARE * schedule.iterations), COLOR_UPDATES * len(chosen))
-        learned = config.light.frame_colors and config.train_on == "train"
         schedule = replace(
             schedule,
-            glare_decided_at=glare_decided,
-            colors_decided_at=colors_decided if learned and colors_decided <= glare_decided else None,
+            glare_decided_at=int(GLARE_TRIAL_SHARE * schedule.iterations),
+            colors_decided_at=config.color_trial(len(chosen)),
         )
     cameras = sequence.cameras[chosen]
     tried, corrected = config.refine_poses == "auto", earlier is None and refines_poses(sequence, config)

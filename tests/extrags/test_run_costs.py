@@ -203,6 +203,17 @@ class TestGaussians:
         assert branches(trajectories=3, starts=1) == 3
         assert branches(trajectories=3, wave=1) == branches(trajectories=3, score="pairs") == 3
 
+    def test_looking_for_haze_takes_iterations_unless_some_is_kept(self) -> None:
+        """The coarse scene begins anew where frames have neither haze nor white balance of their own."""
+        item = replace(work(), config=profile_config("quick"))
+        given = item.config.coarse.iterations
+        assert item.numbers()["iterations"] == given + max(int(0.15 * given), 10 * 24) + 1
+        assert replace(item, colors_kept=True).numbers()["iterations"] == given
+        # Too many for it to be decided before glare is.
+        assert replace(item, train=1000).numbers()["iterations"] == given
+        oracle = item.config.with_overrides({"coarse.train_on": "all"})
+        assert replace(item, config=oracle).numbers()["iterations"] == given
+
     def test_those_of_a_scene_that_is_there_count(self) -> None:
         item = replace(work(), coarse_gaussians=1234)
         assert item.numbers()["gaussians"] == 1234

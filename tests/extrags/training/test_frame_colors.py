@@ -4,17 +4,20 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from extrags.config import CoarseConfig, DensifyConfig, LightConfig
+from extrags.config import CoarseConfig, DensifyConfig, LightConfig, PipelineConfig
 from extrags.errors import ShapeError
 from extrags.illumination import NearFieldLight
 from extrags.raster.light import ROW_LENGTH
+from extrags.run_costs import Workload
+from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
-from extrags.training import as_reconstructed, reconstruct
+from extrags.training import TrainingResult, as_reconstructed, reconstruct, reconstruction
 from extrags.training.frame_colors import (
     BALANCE_PRIOR,
     FrameColorFit,
@@ -22,6 +25,7 @@ from extrags.training.frame_colors import (
     colored,
     with_corrected_colors,
 )
+from extrags.training.optimise import optimise
 from extrags.training.step import AutogradStep, NativeStep
 from extrags.training.strategies import density_strategy
 from extrags.training.views import real_views
@@ -154,6 +158,42 @@ def test_clear_frames_give_what_they_gave(tube_sequence: EndoscopicSequence) -> 
     assert found.colors is None
     assert torch.equal(found.scene.gaussians.means, expected.scene.gaussians.means)
     assert found.history == expected.history
+
+
+@pytest.mark.parametrize(
+    ("change", "rounds"),
+    [
+        # Numbered from 0, and the one after which it is decided is done.
+        ({}, [43, 280]),
+        # There is nothing to learn them with, and nothing to begin anew.
+        ({"light": LightConfig(enabled=False)}, [280]),
+        ({"light": LightConfig(frame_colors=False)}, [280]),
+    ],
+    ids=["learned", "without light", "switched off"],
+)
+def test_the_iterations_that_costs_count_are_done(
+    tube_sequence: EndoscopicSequence,
+    monkeypatch: pytest.MonkeyPatch,
+    change: dict[str, object],
+    rounds: list[int],
+) -> None:
+    config = CoarseConfig(iterations=280, max_points=100, densify=DensifyConfig(enabled=False))
+    config, drawn = config.model_copy(update=change), []
+
+    def counted(start: Scene, draw: Any, schedule: Any, **more: Any) -> TrainingResult:
+        drawn.append(0)
+
+        def one(iteration: int) -> Any:
+            drawn[-1] += 1
+            return draw(iteration)
+
+        return optimise(start, one, schedule, **more)
+
+    monkeypatch.setattr(reconstruction, "optimise", counted)
+    assert reconstruct(tube_sequence, config).colors is None
+    assert drawn == rounds
+    work = Workload(20_480, 8, 4, 4, PipelineConfig(coarse=config))
+    assert work.numbers()["iterations"] == sum(drawn)
 
 
 @pytest.mark.parametrize(
