@@ -44,6 +44,13 @@ INITIAL_GLARE = 0.02
 """Initial values of the parameters: moderate angular spread, partly Lambertian surfaces, a soft shoulder, a
 faint and broad specular lobe, hardly any glare."""
 
+SMOOTHED_FROM = 8
+"""Training frames of a recording from which on their exposures tell whether they scatter."""
+SMOOTHING = (1.0, 2.0, 4.0, 8.0, math.inf)
+"""Standard deviations of means over several exposures, in steps between training frames."""
+SMOOTHER = 0.9
+"""Share of interpolation's squared error that a mean leaves at most, when training frames are left out."""
+
 _LATER = ("log_specular", "log_roughness", "log_glare")
 """Parameters that lights of before there were highlights, or glare, do not have."""
 
@@ -144,8 +151,10 @@ class NearFieldLight:
         On the processor, wherever the light is.
 
         Automatic exposure changes slowly. Between training frames of the same recording the log-exposure is
-        interpolated linearly over the frame index; before the first and after the last it is constant.
-        Frames of a recording without training frames get the mean exposure.
+        interpolated linearly over the frame index; before the first and after the last it is constant. Where
+        leaving out one training frame after the other shows that a mean over several predicts them better,
+        the exposures of single frames are scatter, and what lies between gets that mean. Training frames have
+        their own exposure, and frames of a recording without any the mean one.
 
         Args:
             frames: indices of the frames in the sequence.
@@ -169,7 +178,7 @@ class NearFieldLight:
         for which in np.unique(owner[train]):
             known, wanted = owner[train] == which, owner[frames] == which
             order = np.argsort(train[known], kind="stable")
-            result[wanted] = np.interp(frames[wanted], train[known][order], logs[known][order])
+            result[wanted] = _between(train[known][order], logs[known][order], frames[wanted])
         return torch.from_numpy(np.exp(result).astype(np.float32))
 
     def falloff(
@@ -313,3 +322,36 @@ class NearFieldLight:
         names = [name for name in names if name in group or name not in _LATER]
         values = {name: torch.from_numpy(read_array(group, name)) for name in names}
         return cls(**values, reference_distance=float(group.attrs["reference_distance"]))  # type: ignore[arg-type]
+
+
+def _between(
+    train: Int[np.ndarray, "k"], logs: Float[np.ndarray, "k"], frames: Int[np.ndarray, "m"]
+) -> Float[np.ndarray, "m"]:
+    """Log-exposures of frames of one recording, from those of its training frames, which are in order."""
+    found = np.asarray(np.interp(frames, train, logs))
+    if len(train) < SMOOTHED_FROM:
+        return found
+    places, step = train.astype(np.float64), float(np.median(np.diff(train)))
+    before, left, after = places[:-2], places[1:-1], places[2:]
+    share = (left - before) / (after - before)
+    predicted = (1 - share) * logs[:-2] + share * logs[2:]
+    best, width = SMOOTHER * float(np.mean(np.square(logs[1:-1] - predicted))), 0.0
+    for times in SMOOTHING:
+        away = np.abs(places[:, None] - places) / (times * step)
+        np.fill_diagonal(away, np.inf)
+        error = float(np.mean(np.square(logs - _mean(logs, away))[1:-1]))
+        if error < best:
+            best, width = error, times * step
+    if width == 0:
+        return found
+    others = ~np.isin(frames, train)
+    inside = frames[others].clip(train[0], train[-1]).astype(np.float64)
+    found[others] = _mean(logs, np.abs(inside[:, None] - places) / width)
+    return found
+
+
+def _mean(values: Float[np.ndarray, "k"], away: Float[np.ndarray, "m k"]) -> Float[np.ndarray, "m"]:
+    """Means with the weights of a Gaussian of so many standard deviations; far from all, of the nearest."""
+    weights = np.exp(-0.5 * (np.square(away) - np.square(away.min(1, keepdims=True))))
+    # Not as a matrix product, whose rounding depends on the number of threads.
+    return np.asarray((weights * values).sum(1) / weights.sum(1))

@@ -23,7 +23,7 @@ VIEWS_FILE = "views.json"
 """`EvaluationResult.per_view` by the digest of the renders."""
 
 
-@stage("evaluate-render", version=5)
+@stage("evaluate-render", version=6)
 def render(
     slot: Slot, scene: Ref, sequence: Ref, train_on: Literal["train", "all"], device: str = "cpu"
 ) -> None:

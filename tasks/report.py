@@ -32,7 +32,7 @@ REPORT_PARTS: tuple[Part, ...] = tuple(part for stage in REGISTRY for part in st
 
 # `rows` holds the times of the stages in this run. The page shows them, but they are not part of its cache
 # key.
-@stage("report", version=24, ignore=("rows",))
+@stage("report", version=25, ignore=("rows",))
 def report(
     slot: Slot,
     name: str,

@@ -154,6 +154,45 @@ class TestNearFieldLight:
         torch.testing.assert_close(gains.log(), expected)
         torch.testing.assert_close(light().interpolated_exposures(train, train), light().exposures())
 
+    def test_exposures_that_scatter_are_averaged(self) -> None:
+        train = np.delete(np.arange(120), np.arange(2, 120, 4))
+        scatter = 0.05 * np.random.default_rng(0).normal(size=len(train))
+        lamp = replace(light(), log_exposure=torch.from_numpy((scatter - scatter.mean()).astype(np.float32)))
+        frames = np.arange(2, 120, 4)
+        between = lamp.interpolated_exposures(frames, train).log()
+        interpolated = np.interp(frames, train, scatter - scatter.mean())
+        assert between.square().mean().sqrt() < 0.6 * np.sqrt(np.mean(interpolated**2))
+        torch.testing.assert_close(lamp.interpolated_exposures(train, train), lamp.exposures())
+
+    def test_exposures_that_drift_are_followed_through_their_scatter(self) -> None:
+        train = np.delete(np.arange(120), np.arange(2, 120, 4))
+        drift = 0.3 * np.sin(np.arange(120) / 15)
+        drift -= drift[train].mean()
+        scatter = 0.05 * np.random.default_rng(1).normal(size=len(train))
+        scatter -= scatter.mean()
+        lamp = replace(light(), log_exposure=torch.from_numpy((drift[train] + scatter).astype(np.float32)))
+        frames = np.arange(2, 120, 4)
+        error = lamp.interpolated_exposures(frames, train).log().numpy() - drift[frames]
+        interpolated = np.interp(frames, train, drift[train] + scatter) - drift[frames]
+        assert np.sqrt(np.mean(error**2)) < 0.7 * np.sqrt(np.mean(interpolated**2))
+
+    @pytest.mark.parametrize("values", [np.sin(np.arange(30) / 2), np.repeat([-0.3, 0.3], 15)])
+    def test_exposures_that_change_smoothly_or_at_once_are_interpolated(self, values: np.ndarray) -> None:
+        train = np.arange(0, 60, 2)
+        lamp = replace(light(), log_exposure=torch.from_numpy((values - values.mean()).astype(np.float32)))
+        frames = np.arange(1, 60, 6)
+        expected = np.interp(frames, train, values - values.mean())
+        np.testing.assert_allclose(lamp.interpolated_exposures(frames, train).log(), expected, atol=1e-6)
+
+    def test_a_frame_in_a_long_pause_has_the_exposure_of_the_nearest(self) -> None:
+        train = np.concatenate([np.arange(0, 40, 2), np.arange(20_000, 20_040, 2)])
+        scatter = 0.02 * np.random.default_rng(2).normal(size=40)
+        values = np.repeat([-0.4, 0.4], 20) + scatter - scatter.mean()
+        lamp = replace(light(), log_exposure=torch.from_numpy(values.astype(np.float32)))
+        gains = lamp.interpolated_exposures(np.array([15, 60, 19_000, 20_011]), train).log()
+        assert gains[:2].max() < -0.3
+        assert gains[2:].min() > 0.3
+
     def test_exposures_of_other_frames_are_refused(self) -> None:
         exposures = len(light().log_exposure)
         train = np.arange(exposures + 1)
