@@ -39,7 +39,7 @@ MOST_ERROR = 0.1
 LEAST_FRAMES = 2
 """Other frames that have to look through a point."""
 
-LEAST_CLEAR = 0.25
+LEAST_CLEAR = 0.5
 """Share of a region that two frames look through clearly: at the edge of a fold that is a little off, few."""
 
 LEAST_AREA = 0.003

@@ -12,7 +12,7 @@ from extrags.cameras import invert_poses
 from extrags.config import IngestConfig
 from extrags.sequence import EndoscopicSequence, Split
 
-AS_STORED = IngestConfig(correct_calibration=False, depth_error=0)
+AS_STORED = IngestConfig(correct_calibration=False, mask_foreground=False, depth_error=0)
 """For tests of what belongs together, and not of depth that poses contradict, as rounded or made-up depth
 does: what would be corrected of it is not looked for, which takes several times as long as reading."""
 

@@ -51,7 +51,7 @@ def varied(clip):
 class TestRoundTrip:
     def test_sequence_to_colmap_to_sequence(self, varied, tmp_path, binary) -> None:
         write_colmap(varied, tmp_path / "scene", binary=binary)
-        back = read(tmp_path / "scene")
+        back = read(tmp_path / "scene", AS_STORED)
         same_frames(back, varied, atol=ROUNDING)
         np.testing.assert_array_equal(back.depth_mm, varied.depth_mm)
         np.testing.assert_array_equal(back.points, varied.points)
@@ -173,7 +173,7 @@ class TestReading:
             image = cv2.imread(str(file))
             beside.mkdir(exist_ok=True)
             cv2.imwrite(str(beside / file.name), 255 - image)
-        back = read(tmp_path / "scene")
+        back = read(tmp_path / "scene", AS_STORED)
         same_frames(back, varied, atol=ROUNDING)
         np.testing.assert_array_equal(back.mask, varied.mask)
         np.testing.assert_array_equal(back.depth_mm, varied.depth_mm)
