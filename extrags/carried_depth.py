@@ -340,19 +340,26 @@ class CarriedDepth:
                 best = ratio
         return best
 
-    def _found_pairs(self) -> list[Pair]:
-        """Pairs of training frames that see the same surface from places that differ."""
-        count, typical = len(self.cameras), self.typical.copy()
+    def sources(self, chosen: Int[np.ndarray, "k"]) -> dict[int, list[int]]:
+        """The frames that some are compared with: they see the same surface from places that differ.
+
+        Args:
+            chosen: positions among the training frames.
+        """
+        typical = self.typical.copy()
         if not (typical > 0).any():
-            return []
+            return {}
         typical[typical == 0] = np.median(typical[typical > 0])
-        chosen = evenly(count, CHECKED_FRAMES)
         poses, K = (part.astype(np.float64) for part in (self.cameras.world_from_camera, self.cameras.K))
         size = self.cameras.height, self.cameras.width
-        sources = select_sources(poses, K, size, typical, COMPARED_WITH, chosen)
+        found = select_sources(poses, K, size, typical, COMPARED_WITH, chosen)
+        return {k: [other for other in found[k].tolist() if other >= 0] for k in chosen.tolist()}
+
+    def _found_pairs(self) -> list[Pair]:
+        """Pairs of some frames and their sources that meet enough of each other's surface."""
         found = []
-        for position in chosen.tolist():
-            pairs = [Pair(position, other) for other in sources[position].tolist() if other >= 0]
+        for position, others in self.sources(evenly(len(self.cameras), CHECKED_FRAMES)).items():
+            pairs = [Pair(position, other) for other in others]
             for pair, ratio in zip(pairs, self.log_ratios(pairs), strict=True):
                 if np.isfinite(ratio).sum() >= LEAST_POINTS:
                     self._ratios[pair] = ratio

@@ -16,11 +16,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from extrags.cameras import project_points, transform_points, unproject_pixels
-from extrags.carried_depth import CHECKED_FRAMES, COMPARED_WITH, CarriedDepth, evenly, relative_error
+from extrags.carried_depth import CHECKED_FRAMES, CarriedDepth, evenly, relative_error
 from extrags.frame_stacks import stacked
 from extrags.observed_surface import observed_through_masks
 from extrags.sequence import EndoscopicSequence
-from extrags.source_frames import select_sources
 
 __all__ = ["foreground_objects", "without_foreground_objects"]
 
@@ -167,7 +166,7 @@ def foreground_objects(carried: CarriedDepth) -> dict[int, Bool[np.ndarray, "h w
     if not suspects:
         return {}
     if count > len(tried):
-        suspects, others = list(range(count)), _sources(carried)
+        suspects, others = list(range(count)), carried.sources(np.arange(count))
     found = {}
     for position in suspects:
         region = _objects(_votes(carried, position, others[position], error, PIXELS))
@@ -178,15 +177,6 @@ def foreground_objects(carried: CarriedDepth) -> dict[int, Bool[np.ndarray, "h w
 
 def _is_suspect(votes: _Votes) -> bool:
     return bool((votes.in_front & votes.clearly_in_front).mean() >= TRIED_AREA)
-
-
-def _sources(carried: CarriedDepth) -> dict[int, list[int]]:
-    """The frames that each training frame is compared with."""
-    cameras, typical = carried.cameras, carried.typical.copy()
-    typical[typical == 0] = np.median(typical[typical > 0])
-    poses, K = (part.astype(np.float64) for part in (cameras.world_from_camera, cameras.K))
-    chosen = select_sources(poses, K, (cameras.height, cameras.width), typical, COMPARED_WITH)
-    return {k: [int(other) for other in row if other >= 0] for k, row in enumerate(chosen)}
 
 
 def _votes(carried: CarriedDepth, position: int, others: list[int], error: float, pixels: int) -> _Votes:
