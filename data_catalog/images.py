@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from data_catalog.inside import inside
-from extrags.array_files import MOST_PIXELS, TOO_MANY_PIXELS, load_npy
+from extrags.array_files import COLORED_PALETTE, MOST_PIXELS, TOO_MANY_PIXELS, image_numbers, load_npy
 from extrags.errors import SourceError, SourceNotFoundError, reason_of
 from extrags.events import Progress, emit
 from extrags.frame_names import COLOR_SUFFIXES, NameOrder, names_in_folders
@@ -355,18 +355,10 @@ def _stored_numbers(file: Path, frame: object) -> np.ndarray:
 
     with _image_errors(file, frame, "depth"), Image.open(file) as image:
         image.load()
-        if image.mode not in ("P", "PA"):
-            return np.asarray(image)
-        colors = np.asarray(image.convert("RGB"))
-    # Programs that make files smaller store grey of few values as places in a palette.
-    if (colors != colors[..., :1]).any():
-        raise SourceError(
-            "colours of a palette; expected one number per pixel, not depth in false colours",
-            file=file,
-            frame=frame,
-            field="depth",
-        )
-    return colors[..., 0]
+        values = image_numbers(image)
+    if values is None:
+        raise SourceError(COLORED_PALETTE, file=file, frame=frame, field="depth")
+    return values
 
 
 def depth_suffixes_in_words() -> str:

@@ -16,11 +16,14 @@ import numpy as np
 from extrags.output_files import whole_file
 
 if TYPE_CHECKING:
+    from PIL.Image import Image
     from torch import Tensor
 
 __all__ = [
+    "COLORED_PALETTE",
     "MOST_PIXELS",
     "TOO_MANY_PIXELS",
+    "image_numbers",
     "load_npy",
     "load_npz",
     "load_ply_vertices",
@@ -33,10 +36,28 @@ __all__ = [
 MOST_PIXELS = 178_956_970
 """Of an image or a depth map that is read. Pillow takes a larger one for a file made to fill the memory."""
 TOO_MANY_PIXELS = f"too large: more than the {MOST_PIXELS} pixels that are read"
+COLORED_PALETTE = "colours of a palette; expected one number per pixel, not depth in false colours"
 _PLY_HEADER_BYTES = 1 << 16
 _MOST_UNPACKED_BYTES = 1 << 30
 _MOST_UNPACKED_SHARE = 100
 """Of its own size: numbers that were measured or trained are packed to no less than a tenth."""
+
+
+def image_numbers(image: Image) -> np.ndarray | None:
+    """Pixels of an opened image that holds numbers, such as depth; a palette of greys is undone.
+
+    Args:
+        image: of any mode.
+
+    Returns:
+        [H, W], or [H, W, C] where pixels have several; None for a palette of colours, whose places say
+        nothing (`COLORED_PALETTE`).
+    """
+    if image.mode not in ("P", "PA"):
+        return np.asarray(image)
+    # Programs that make files smaller store grey of few values as places in a palette.
+    colors = np.asarray(image.convert("RGB"))
+    return None if (colors != colors[..., :1]).any() else colors[..., 0]
 
 
 def load_npy(file: Path, *, most: int | None = None) -> np.ndarray:

@@ -14,12 +14,11 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
 
-from extrags.array_files import MOST_PIXELS, TOO_MANY_PIXELS, load_npy
+from extrags.array_files import COLORED_PALETTE, MOST_PIXELS, TOO_MANY_PIXELS, image_numbers, load_npy
 from extrags.errors import (
     ConfigError,
     NonFiniteError,
@@ -32,9 +31,6 @@ from extrags.frame_names import NameOrder, names_in_folders, tell_about_order
 from extrags.frame_stacks import stacked
 from extrags.metrics.protocol import RenderedViews
 from extrags.sequence import EndoscopicSequence
-
-if TYPE_CHECKING:
-    from PIL import Image
 
 __all__ = ["read_renders"]
 
@@ -234,18 +230,19 @@ def _color(file: Path, shape: tuple[int, int]) -> Float[np.ndarray, "h w 3"]:
 def _depth(file: Path, shape: tuple[int, int], step_mm: float | None) -> Float[np.ndarray, "h w"]:
     from PIL import Image, UnidentifiedImageError
 
+    values: np.ndarray | None
     try:
         if file.suffix.lower() == ".npy":
             values = load_npy(file, most=MOST_PIXELS)
         else:
             with Image.open(file) as image:
-                values = _numbers(image, file)
-    except SourceError:
-        raise
+                values = image_numbers(image)
     except Image.DecompressionBombError as error:
         raise SourceError(TOO_MANY_PIXELS, file=file) from error
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
         raise SourceError(f"this is no depth map that can be read: {reason_of(error)}", file=file) from error
+    if values is None:
+        raise SourceError(COLORED_PALETTE, file=file, field="mode")
     values = values[..., 0] if values.ndim == 3 and values.shape[-1] == 1 else values
     if values.ndim != 2:
         raise ShapeError(f"{file}: a depth map has shape {values.shape}, expected two dimensions")
@@ -257,24 +254,6 @@ def _depth(file: Path, shape: tuple[int, int], step_mm: float | None) -> Float[n
     if not np.isfinite(values).all():
         raise NonFiniteError(f"{file}: depth holds NaN or infinity; 0 means that there is no surface")
     return np.asarray(values.astype(np.float32))
-
-
-def _numbers(image: Image.Image, file: Path) -> np.ndarray:
-    """The pixels of an opened image; a palette of greys, which makes files smaller, is undone.
-
-    Raises:
-        SourceError: for a palette of colours, whose places are no depth.
-    """
-    if image.mode not in ("P", "PA"):
-        return np.asarray(image)
-    colors = np.asarray(image.convert("RGB"))
-    if (colors != colors[..., :1]).any():
-        raise SourceError(
-            "colours of a palette; expected one number per pixel, not depth in false colours",
-            file=file,
-            field="mode",
-        )
-    return colors[..., 0]
 
 
 def _check_size(file: Path, found: tuple[int, ...], expected: tuple[int, int]) -> None:
