@@ -192,7 +192,7 @@ def check_depth_scale(sequence: EndoscopicSequence, *, file: object = None, dept
         moved[:, :3, 3] /= factor
         return _reprojection_error(sequence, moved, pairs, seen, at_most)
 
-    # Most factors fit so badly that one pair of frames rules them out.
+    # Most factors fit so badly that one pair of frames rules them out; not a number stays where all do.
     factor, best = np.nan, min(_CLEARLY_BETTER * as_given, _CONVINCING_ERROR)
     for other in _DEPTH_FACTORS.tolist():
         error = error_with(other, best)

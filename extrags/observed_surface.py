@@ -157,6 +157,9 @@ def observed_through_masks(
     Args:
         sequence: with the new masks, and what was observed with the old ones.
         stage: whose progress it is.
+
+    Returns:
+        True where observed, [F, H, W]; None where the sequence does not know.
     """
     depth = sequence.true_depth_mm
     if sequence.observed is None or depth is None or sequence.world_from_camera is None:

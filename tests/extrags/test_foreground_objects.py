@@ -130,12 +130,11 @@ def test_where_all_seems_in_front_nothing_is_masked(
     assert "more than instruments can; nothing is masked" in caplog.text
 
 
-def test_of_many_frames_all_are_looked_at(
-    instrument: tuple[EndoscopicSequence, np.ndarray], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    sequence, _ = instrument
+def test_of_many_frames_all_are_looked_at(exact: EndoscopicSequence, monkeypatch: pytest.MonkeyPatch) -> None:
+    sequence, _ = with_instrument(exact, every=2)
     monkeypatch.setattr("extrags.foreground_objects.CHECKED_FRAMES", 4)
     monkeypatch.setattr("extrags.carried_depth.CHECKED_FRAMES", 4)
     assert len(sequence.train) < CHECKED_FRAMES
     monkeypatch.setattr("extrags.carried_depth.LEAST_PAIRS", 1)
-    assert {3, 6, 9} <= set(found_in(sequence))
+    # Of these the sixth alone is among the four that tell whether there is anything.
+    assert {4, 6, 8} <= set(found_in(sequence))
