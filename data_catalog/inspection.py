@@ -28,14 +28,7 @@ from extrags.sequence import EndoscopicSequence, saturated_mask
 
 __all__ = ["Finding", "Inspection", "contact_sheet", "facts", "inspect"]
 
-LOGGERS = (
-    "data_catalog",
-    "extrags.depth_noise",
-    "extrags.frame_names",
-    "extrags.measured_depth",
-    "extrags.rig_calibration",
-    "extrags.unusable_frames",
-)
+LOGGERS = ("data_catalog", "extrags")
 """Of what looks at a source while it is read."""
 _TILE_WIDTH = 240
 _MAX_TILES = 30

@@ -10,6 +10,7 @@ from extrags.measured_depth import as_given, with_depth_error
 from extrags.rig_calibration import with_calibration_corrected
 from extrags.scarce_depth import without_scarce_depth
 from extrags.sequence import EndoscopicSequence
+from extrags.switched_light import with_matched_light
 from extrags.unusable_frames import without_blank_frames, without_misplaced_frames
 
 __all__ = ["as_given", "with_corrections"]
@@ -18,11 +19,11 @@ __all__ = ["as_given", "with_corrections"]
 def with_corrections(sequence: EndoscopicSequence, config: IngestConfig | None = None) -> EndoscopicSequence:
     """The sequence without unusable frames, its depth cleaned, brought into line with the poses, and judged.
 
-    In this order, each with a warning where it changes anything: frames that show nothing are left out; depth
-    of few frames is left to the evaluation; speckles and noise of depth are taken out; what all frames have
-    in common and is off is corrected; frames whose poses are grossly wrong are left out; objects in front of
-    the surface are masked; and depth that frames disagree about is given an expected error. Of a sequence
-    without poses the first alone.
+    In this order, each with a warning where it changes anything: frames that show nothing are left out;
+    frames of another light get the colours of the others; depth of few frames is left to the evaluation;
+    speckles and noise of depth are taken out; what all frames have in common and is off is corrected; frames
+    whose poses are grossly wrong are left out; objects in front of the surface are masked; and depth that
+    frames disagree about is given an expected error. Of a sequence without poses the first two alone.
 
     Args:
         sequence: as its source has it.
@@ -30,6 +31,8 @@ def with_corrections(sequence: EndoscopicSequence, config: IngestConfig | None =
     """
     config = IngestConfig() if config is None else config
     sequence = without_blank_frames(sequence)
+    if config.match_light:
+        sequence = with_matched_light(sequence)
     if sequence.world_from_camera is None:
         return sequence
     sequence = without_scarce_depth(sequence)

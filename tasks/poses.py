@@ -17,8 +17,8 @@ def estimating_settings(config: PosesConfig) -> PosesConfig:
 
 
 def lens_settings(config: IngestConfig) -> IngestConfig:
-    """The settings of reading that say what becomes of depth, masks, and frames of a distorting lens."""
-    kept = ["depth_error", "correct_calibration", "mask_foreground"]
+    """The settings of reading that say what becomes of depth, masks, colours, and of a distorting lens."""
+    kept = ["depth_error", "correct_calibration", "mask_foreground", "match_light"]
     if config.lens != "pinhole" or config.field_of_view_deg is not None:
         # Sizes are those of a pinhole that is wider than the lens's centre.
         kept += ["lens", "field_of_view_deg", "size", "width", "downscale"]

@@ -108,6 +108,11 @@ class IngestConfig(StageConfig):
         description="of sources with poses and depth: mask what training frames show in front of the "
         "surface and other frames look through, such as instruments",
     )
+    match_light: bool = Field(
+        True,
+        description="where some training frames were recorded under another light, such as narrow-band "
+        "imaging, and features show how colours of both differ: give them the colours of the others",
+    )
     scale_mm_per_unit: float | None = Field(
         None,
         gt=0,

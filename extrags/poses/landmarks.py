@@ -8,17 +8,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from extrags.cameras import invert_poses, unproject_pixels
+from extrags.feature_matches import mutual_matches, sift_features
 from extrags.metrics.pose import umeyama
 from extrags.sequence import EndoscopicSequence
 
-__all__ = ["Landmarks", "landmarks", "match_landmarks", "relative_pose"]
+__all__ = ["Landmarks", "landmarks", "relative_pose"]
 
-FEATURES = 1500
-CONTRAST = 0.004
-RATIO = 0.9
 MIN_MATCHES = 8
 TRIPLETS = 400
 CLOSE_SHARE = 0.03
@@ -39,49 +37,17 @@ class Landmarks:
 
 
 def landmarks(sequence: EndoscopicSequence, frame: int) -> Landmarks:
-    """SIFT features of a frame, inside the mask and where depth is known.
-
-    Source: Lowe: Distinctive image features from scale-invariant keypoints, IJCV 2004; root of the
-    descriptors: Arandjelović and Zisserman, CVPR 2012.
-    """
-    import cv2
-
-    nothing = Landmarks(np.zeros((0, 3)), np.zeros((0, 128), np.float32))
+    """SIFT features of a frame, inside the mask and where depth is known."""
     if sequence.depth_mm is None:
-        return nothing
+        return Landmarks(np.zeros((0, 3)), np.zeros((0, 128), np.float32))
     depth = sequence.depth_mm[frame]
     told = sequence.supervised_mask(frame) & (depth > 0) & np.isfinite(depth)
-    grey = cv2.cvtColor(np.ascontiguousarray(sequence.rgb[frame]), cv2.COLOR_RGB2GRAY)
-    # Mucosa is pale and unevenly lit: contrast is raised block by block.
-    grey = cv2.createCLAHE(clipLimit=4.0, tileGridSize=(8, 8)).apply(grey)
-    finder = cv2.SIFT_create(nfeatures=FEATURES, contrastThreshold=CONTRAST, edgeThreshold=20)  # type: ignore[attr-defined]
-    keypoints, descriptors = finder.detectAndCompute(grey, told.astype(np.uint8) * 255)
-    if descriptors is None or len(keypoints) == 0:
-        return nothing
-    pixels = np.array([keypoint.pt for keypoint in keypoints]) + 0.5
-    column = np.clip(np.floor(pixels[:, 0]).astype(np.int64), 0, sequence.width - 1)
-    row = np.clip(np.floor(pixels[:, 1]).astype(np.int64), 0, sequence.height - 1)
+    features = sift_features(sequence.rgb[frame], told)
+    row, column = features.rows_and_columns(sequence.height, sequence.width)
     kept = told[row, column]
-    # Threads find features in any order.
-    order = np.lexsort((descriptors[:, 0], descriptors[:, 1], pixels[:, 0], pixels[:, 1]))
-    order = order[kept[order]]
     z = depth[row, column].astype(np.float64)
-    points = unproject_pixels(pixels, sequence.K[frame]) * z[:, None]
-    roots = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-9))
-    return Landmarks(points[order], roots[order].astype(np.float32))
-
-
-def match_landmarks(first: Landmarks, second: Landmarks) -> Int[np.ndarray, "m 2"]:
-    """Rows that are each other's nearest and clearly nearer than the second nearest."""
-    if len(first.points) < 2 or len(second.points) < 2:
-        return np.zeros((0, 2), dtype=np.int64)
-    likeness = first.descriptors @ second.descriptors.T
-    best = likeness.argmax(1)
-    mutual = likeness.argmax(0)[best] == np.arange(len(best))
-    two = -np.partition(-likeness, 1, axis=1)[:, :2]
-    distance = np.sqrt(np.clip(2 - 2 * two, 1e-12, None))
-    kept = np.flatnonzero(mutual & (distance[:, 0] < RATIO * distance[:, 1]))
-    return np.stack([kept, best[kept]], axis=1)
+    points = unproject_pixels(features.pixels, sequence.K[frame]) * z[:, None]
+    return Landmarks(points[kept], features.descriptors[kept])
 
 
 def relative_pose(
@@ -99,7 +65,7 @@ def relative_pose(
 
     Source: Fischler and Bolles: Random sample consensus, CACM 1981.
     """
-    matches = match_landmarks(moving, reference)
+    matches = mutual_matches(moving.descriptors, reference.descriptors)
     if len(matches) < MIN_MATCHES:
         return None, 0
     source, target = moving.points[matches[:, 0]], reference.points[matches[:, 1]]

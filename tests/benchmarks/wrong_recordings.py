@@ -121,6 +121,12 @@ def _haze(count: int) -> Callable[[int, np.ndarray], np.ndarray]:
     return lambda place, light: 0.65 * light + 0.1 if place * 3 // count == 1 else light
 
 
+def _narrow_band(count: int) -> Callable[[int, np.ndarray], np.ndarray]:
+    """Light of narrow bands in the middle third: green for red, and blue for both others."""
+    mixing = np.array([[0.04, 0.60, 0.04], [0.02, 0.20, 0.40], [0.02, 0.24, 0.42]])
+    return lambda place, light: light @ mixing.T if place * 3 // count == 1 else light
+
+
 def _blank(sequence: Sequence) -> Sequence:
     rgb = np.array(sequence.rgb)
     rgb[np.sort(sequence.train)[4::8]] = 0
@@ -180,6 +186,7 @@ WRONG: dict[str, Callable[[Sequence], Sequence]] = {
     "hand-eye": _hand_eye,
     "white balance": lambda sequence: _developed(sequence, _white_balance),
     "haze": lambda sequence: _developed(sequence, _haze(len(sequence.train))),
+    "narrow band": lambda sequence: _developed(sequence, _narrow_band(len(sequence.train))),
     "blank": _blank,
     "misplaced": _misplaced,
     "instrument": lambda sequence: with_instrument(sequence)[0],

@@ -21,6 +21,8 @@ from extrags.cameras import invert_poses, pixel_rays
 from extrags.config import IngestConfig
 from extrags.errors import PoseError, SourceError, UnknownSequenceError
 from extrags.sequence import EndoscopicSequence, Split
+from tests.benchmarks.wrong_recordings import WRONG
+from tests.extrags.depth.withheld import recorded
 
 
 class TestRightSources:
@@ -313,6 +315,16 @@ class TestPoseSupport:
         support = pose_support(sequence, match_neighbours(sequence))
         assert support.as_given > 0.82
         assert support.best_name == ""
+
+
+def test_all_that_is_corrected_is_told(clip, tmp_path) -> None:
+    """Instruments and depth of few frames were on the log alone."""
+    (tmp_path / "rgb").mkdir()
+    for number, rgb in enumerate(WRONG["narrow band"](recorded(12, 160, 128)).rgb[:12]):
+        Image.fromarray(rgb).save(tmp_path / "rgb" / f"{number:04d}.png")
+    told = inspect(tmp_path)
+    assert [(finding.topic, finding.field) for finding in told.findings] == [("light", "rgb")]
+    assert not told.ok
 
 
 def test_black_frames_are_neither_repeats_nor_jumps_of_exposure(clip) -> None:

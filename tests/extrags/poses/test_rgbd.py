@@ -12,10 +12,11 @@ from extrags.cameras import pixel_rays
 from extrags.config import PosesConfig
 from extrags.errors import CaptureError
 from extrags.events import Event, Progress, subscribed
+from extrags.feature_matches import mutual_matches
 from extrags.poses import RgbdAlignment, align_by_depth, errors_against_given
 from extrags.poses.alignment import TUKEY, Posed, _solved, _tukey, agreement, align, pair_equations
 from extrags.poses.depth_views import depth_view
-from extrags.poses.landmarks import Landmarks, landmarks, match_landmarks, relative_pose
+from extrags.poses.landmarks import Landmarks, landmarks, relative_pose
 from extrags.sequence import EndoscopicSequence, Split
 from tests.extrags.poses.textured_room import HALF_SIZE_MM, room_sequence
 
@@ -249,7 +250,7 @@ class TestLandmarks:
     def test_no_landmarks(self, sequence: EndoscopicSequence) -> None:
         none = landmarks(replace(sequence, rgb=np.full_like(sequence.rgb, 90)), 0)
         assert len(none.points) == 0
-        assert len(match_landmarks(none, none)) == 0
+        assert len(mutual_matches(none.descriptors, none.descriptors)) == 0
         assert relative_pose(none, landmarks(sequence, 0), seed=0) == (None, 0)
 
 
