@@ -95,7 +95,7 @@ def carve(
     free |= lens
     # The distance is that of faces: a voxel's own half does not count.
     near = distance_to_cubes(surface, config.wall_voxels) <= config.wall_voxels - 0.5
-    occupied = near & ~free
+    occupied = (surface | near) & ~free
     radius = config.passage_share * views.unit_mm / voxel_mm
     free = lens | reachable(free, _clearance(free, occupied), at_cameras, radius)
     if not free.any():

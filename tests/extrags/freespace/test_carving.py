@@ -269,7 +269,7 @@ class TestCarve:
         assert space.lookup(np.array([0.0, 0, 11.0])) == UNKNOWN
         assert space.lookup(np.array([8.0, 0, 11.0])) == FREE
 
-    @pytest.mark.parametrize(("wall_voxels", "layers"), [(1.5, 1), (3.0, 3)])
+    @pytest.mark.parametrize(("wall_voxels", "layers"), [(0.3, 0), (1.5, 1), (3.0, 3)])
     def test_the_wall_is_as_thick_as_is_asked_for(self, wall_voxels, layers):
         scene, wall = scene_of_points(sheet(16.0, half=20.0, n=80)), sheet_mesh(16.0, 20.0)
         config = FreespaceConfig(grid_size=32, wall_voxels=wall_voxels, passage_share=0.0, margin_share=0.2)
