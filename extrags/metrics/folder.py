@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -27,14 +27,13 @@ from extrags.errors import (
     SourceNotFoundError,
     reason_of,
 )
-from extrags.frame_names import NameOrder, names_in_folders, tell_about_order
+from extrags.frame_names import COLOR_SUFFIXES, NameOrder, names_in_folders, tell_about_order
 from extrags.frame_stacks import stacked
 from extrags.metrics.protocol import RenderedViews
 from extrags.sequence import EndoscopicSequence
 
 __all__ = ["read_renders"]
 
-COLOR_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"})
 DEPTH_SUFFIXES = frozenset({".npy", ".png", ".tif", ".tiff"})
 _MAX_LISTED_NAMES = 5
 
@@ -91,7 +90,7 @@ def read_renders(
 def _files_of(
     folder: Path,
     sequence: EndoscopicSequence,
-    suffixes: frozenset[str],
+    suffixes: Collection[str],
     kind: str,
     not_measured: Sequence[str],
 ) -> list[Path]:
@@ -148,7 +147,7 @@ def _by_number(
     return [file for _, file in sorted(zip(keys, files, strict=True))]
 
 
-def _files_at(paths: list[str], folder: Path, suffixes: frozenset[str]) -> dict[Path, str]:
+def _files_at(paths: list[str], folder: Path, suffixes: Collection[str]) -> dict[Path, str]:
     """Files that stand where frames named with their folders say, and which frame each shows."""
     wanted = {path for path in paths if "/" in path}
     if not wanted:
@@ -159,7 +158,7 @@ def _files_at(paths: list[str], folder: Path, suffixes: frozenset[str]) -> dict[
     return {file: place for file, place in places.items() if place in wanted}
 
 
-def _is_meant(file: Path, folder: Path, suffixes: frozenset[str]) -> bool:
+def _is_meant(file: Path, folder: Path, suffixes: Collection[str]) -> bool:
     """Whether a file below a folder is one of its images: not one that macOS has put beside each."""
     hidden = any(part.startswith(".") for part in file.relative_to(folder).parts)
     return not hidden and file.suffix.lower() in suffixes and file.is_file()

@@ -13,6 +13,7 @@ from PIL import Image
 from data_catalog.images import save_images
 from extrags import frame_stacks
 from extrags.errors import ConfigError, NonFiniteError, ShapeError, SourceError, SourceNotFoundError
+from extrags.frame_names import COLOR_SUFFIXES
 from extrags.metrics.folder import _color, read_renders
 from extrags.metrics.protocol import RenderedViews, evaluate_views
 from extrags.sequence import EndoscopicSequence, Split
@@ -83,10 +84,20 @@ def test_hidden_files_are_none_of_them(sequence: EndoscopicSequence, tmp_path: P
         np.testing.assert_array_equal(np.rint(read_renders(folder, given).rgb * 255), LEVELS[TEST])
 
 
-def test_frames_named_like_files(sequence: EndoscopicSequence, tmp_path: Path) -> None:
-    named = replace(sequence, frame_names=tuple(f"rgb/b_{index:04d}.png" for index in range(FRAMES)))
-    folder = write(tmp_path / "renders", {f"b_{index:04d}.png": LEVELS[index] for index in TEST})
+@pytest.mark.parametrize("suffix", COLOR_SUFFIXES)
+def test_frames_named_like_files(sequence: EndoscopicSequence, tmp_path: Path, suffix: str) -> None:
+    names = ("front", "left", "right", "above", "below")
+    named = replace(sequence, frame_names=tuple(f"rgb/{name}{suffix}" for name in names))
+    folder = write(tmp_path / "renders", {f"{names[index]}.png": LEVELS[index] for index in TEST})
     np.testing.assert_array_equal(np.rint(read_renders(folder, named).rgb * 255), LEVELS[TEST])
+
+
+def test_webp_images_are_read(sequence: EndoscopicSequence, tmp_path: Path) -> None:
+    folder = tmp_path / "renders"
+    folder.mkdir()
+    for index in TEST:
+        Image.fromarray(LEVELS[index]).save(folder / f"b_{index:04d}.webp", lossless=True)
+    np.testing.assert_array_equal(np.rint(read_renders(folder, sequence).rgb * 255), LEVELS[TEST])
 
 
 class TestFramesOfSeveralRecordings:
