@@ -134,6 +134,8 @@ class Metric:
         if not re.fullmatch(r"[a-z][a-z0-9_]*", self.key):
             raise ConfigError(f"metric {self.key!r}: a key is lower case letters, digits and underscores")
         known = [path for path, _, kinds in _GROUPS if self.kind in kinds]
+        if not set(self.groups or ()) <= set(known):
+            raise ConfigError(f"metric {self.key}: groups {self.groups}; a {self.kind} metric has {known}")
         for place, groups in self.shown.items():
             if place not in get_args(Place):
                 places = ", ".join(get_args(Place))

@@ -276,6 +276,7 @@ class TestOwnMetric:
             ({"key": "My metric"}, "a key is lower case"),
             ({"shown": {"nowhere": ("",)}}, "no place 'nowhere' to show it; known: tables"),
             ({"shown": {"tables": ("surface",)}}, "a photometric metric has"),
+            ({"groups": ("", "observd")}, "groups .*observd.*; a photometric metric has"),
         ],
     )
     def test_what_makes_no_sense_is_refused(
