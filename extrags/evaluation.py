@@ -34,8 +34,8 @@ def render(
     """Render frames of a sequence by the rules of the evaluation protocol.
 
     Training frames are rendered at their own exposure; held-out frames of a recording with training frames
-    at the exposure interpolated between these; frames of other recordings at the mean exposure. What a view
-    sees from behind stands behind all else, where the scene knows its sides
+    at one that these tell (`NearFieldLight.interpolated_exposures`); frames of other recordings at the mean
+    exposure. What a view sees from behind stands behind all else, where the scene knows its sides
     (`extrags.facing.one_sided_rendering`).
 
     Args:
