@@ -34,6 +34,8 @@ AGREEMENT = 0.05
 is zero."""
 LATTICE_PX = 8
 """Co-visibility is judged on one pixel in this many, along each axis."""
+FITTED_LATTICE_PX = 3
+"""The fall-off of brightness is fitted to one pixel in this many, along each axis."""
 DISTANCE_TOLERANCE = 0.2
 """Absolute log ratio of distances at which the quality of a reference falls to 1/e."""
 ANGLE_TOLERANCE_RAD = 0.3
@@ -291,14 +293,20 @@ def _above_rounding(votes: Float[Tensor, "k p"]) -> Float[Tensor, "k p"]:
 
 
 def _surface(camera: Cameras, depth_mm: Float[Tensor, "1 h w"], stride: int) -> _Surface:
-    offset = stride // 2
-    rays = torch.from_numpy(pixel_rays(camera)[0, offset::stride, offset::stride].astype(np.float32))
-    offsets = (rays * depth_mm[0, offset::stride, offset::stride, None]).reshape(-1, 3)
+    down, along = (_lattice(size, stride) for size in (camera.height, camera.width))
+    rays = torch.from_numpy(pixel_rays(camera)[0, down, along].astype(np.float32))
+    offsets = (rays * depth_mm[0, down, along, None]).reshape(-1, 3)
     distance = offsets.norm(dim=-1).clamp_min(1e-9)
-    normal = depth_normals(_camera_rays(camera), depth_mm)[offset::stride, offset::stride].reshape(-1, 3)
+    normal = depth_normals(_camera_rays(camera), depth_mm)[down, along].reshape(-1, 3)
     rotation = torch.from_numpy(camera.viewmats[0, :3, :3].astype(np.float32))
     direction = offsets / distance[:, None]
     return _Surface(camera.centers[0], offsets, distance, direction, normal, rotation)
+
+
+def _lattice(size: int, stride: int) -> slice:
+    """One pixel in `stride` along an axis; the middle one of an axis that is too short for that."""
+    offset = stride // 2
+    return slice(offset if offset < size else (size - 1) // 2, None, stride)
 
 
 def depth_normals(rays: Float[Tensor, "h w 3"], depth_mm: Float[Tensor, "1 h w"]) -> Float[Tensor, "h w 3"]:
@@ -405,14 +413,16 @@ def fit_falloff_exponent(references: ReferenceViews, *, pairs: int = 24) -> floa
     if count < 2:
         return 0.0
     slopes: list[Tensor] = []
+    size = references.cameras.height, references.cameras.width
+    down, along = (_lattice(pixels, FITTED_LATTICE_PX) for pixels in size)
     for first in np.unique(np.linspace(0, count - 2, min(pairs, count - 1)).round().astype(int)):
         seconds = [s for s in (first + 1, first + 3) if s < count]
         camera = references.cameras[[int(first)]]
         inverse = references.packed[first, 4:5]
         depth = torch.where(inverse > 0, 1 / inverse.clamp_min(1e-12), torch.zeros(()))
-        surface = _surface(camera, depth, 3)
-        own = references.packed[first, :3, 1::3, 1::3].reshape(3, -1).mean(dim=0)
-        trusted = references.packed[first, 3, 1::3, 1::3].reshape(-1)
+        surface = _surface(camera, depth, FITTED_LATTICE_PX)
+        own = references.packed[first, :3, down, along].reshape(3, -1).mean(dim=0)
+        trusted = references.packed[first, 3, down, along].reshape(-1)
         for second in seconds:
             seen = _look_up(references, torch.tensor([second]), surface)
             other = seen.rgb[0].mean(dim=0)

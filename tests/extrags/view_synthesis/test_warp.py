@@ -67,6 +67,24 @@ def test_the_nearest_reference_comes_first_on_request() -> None:
     assert best.nearest_weight.max() > 0.5
 
 
+@pytest.mark.parametrize(("width", "height"), [(40, 4), (3, 3), (1, 30)])
+def test_references_are_ranked_in_views_of_few_rows_or_columns(width: int, height: int) -> None:
+    light = tube_light(1)
+    cameras = tube_cameras(8).resized(width, height)
+    _, depth = cast_tube(cameras, light)
+    references = exact_references(cameras, light)
+    views = torch.from_numpy(depth.astype(np.float32))[:, None]
+    # Trust ends before the border of the image.
+    references.packed[:, 3] = 1
+    scores = covisibility(references, cameras, views)
+    assert scores.isfinite().all()
+    assert torch.equal(scores.argmax(dim=1), torch.arange(8))
+    references.packed[:, 3] = 0
+    named = warp_references(references, cameras, views, count=2, reference="nearest")
+    assert torch.equal(named.reference, torch.arange(8))
+    assert 0 <= fit_falloff_exponent(references) <= 3
+
+
 def test_without_compensation_it_does_not() -> None:
     light, cameras, target, depth = _target()
     references = exact_references(tube_cameras(8), light).with_transfer(LightTransfer(None, 0.0, 20.0))
