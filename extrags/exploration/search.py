@@ -124,8 +124,8 @@ class Branch(Storable):
         poses: `world_from_camera` of the views, the start first, [L', 4, 4]; L' <= L.
         moves: name of the move that led to each further view, L' - 1 of them.
         values: worth of what each further view shows beyond the snapshot and the views before, [L' - 1].
-        seen: rows that the views show beyond the snapshot: N Gaussians, then F frontier voxels.
-        pairs: all (Gaussian, direction) pairs the views cover, packed, [N].
+        seen: rows that the further views show beyond the snapshot: N Gaussians, then F frontier voxels.
+        pairs: all (Gaussian, direction) pairs the further views cover, packed, [N].
         expansions: states expanded.
         renders: images rendered.
         reason: why the search ended.
@@ -323,7 +323,10 @@ class _Search:
         config = self.context.config
         clearance_mm = float(self.context.freespace.clearance_at(start[None, :3, 3])[0])
         (observation,) = self._observe(start[None])
-        current = best = self._state(observation, self.coverage, clearance_mm)
+        # What a training view has shown is in the coverage. Beyond its mask and in its holes nothing was, and
+        # it is not restored: that is for the virtual views to show.
+        nothing = Seen(np.zeros(0, np.int32), np.zeros(0, self.coverage.dtype))
+        current = best = _State(observation, nothing, clearance_mm)
         self.visited.poses.append(start)
         queue: list[tuple[float, int, _State]] = []
         order, expansions = 0, 0
@@ -359,7 +362,7 @@ class _Search:
         context = self.context
         path = last.path()
         pairs = np.zeros(len(context.scene.gaussians), dtype=np.uint32)
-        for state in path:
+        for state in path[1:]:
             observation = state.observation
             pairs[observation.visible] |= gaussian_words(
                 context.scene, observation, context.config.directions
@@ -369,7 +372,7 @@ class _Search:
             poses=np.stack([state.pose for state in path]),
             moves=tuple(state.move for state in path[1:]),
             values=tuple(state.value for state in path[1:]),
-            seen=union(context.value, [state.seen for state in path], self.coverage),
+            seen=union(context.value, [state.seen for state in path[1:]], self.coverage),
             pairs=pairs,
             expansions=expansions,
             renders=self.renders,

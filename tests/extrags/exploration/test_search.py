@@ -16,7 +16,7 @@ from extrags.exploration.darkness import luminance
 from extrags.exploration.primitives import PRIMITIVES, apply_primitives, primitive_motions
 from extrags.exploration.score import fold_weight, net_turn_deg
 from extrags.exploration.search import Branch, SearchContext, grow_branch, prepare_search
-from extrags.exploration.seen import PairValue
+from extrags.exploration.seen import PairValue, union
 from extrags.exploration.waves import Least, WaveState
 from extrags.freespace import FREE, OCCUPIED, FreeSpace
 from extrags.scene import Scene
@@ -169,15 +169,16 @@ class TestGrowBranch:
 
     def test_a_dead_end_resumes_from_the_queue(self):
         ready, turns = disc_context()
-        n = len(ready.scene.gaussians)
-        found = grow_branch(ready, np.eye(4), np.zeros(n, np.uint32))
+        start = ready.measured.known
+        np.testing.assert_array_equal(
+            start, rendered_pairs(ready.scene, ready.scoring_cameras(np.eye(4)[None]), **SEEN)[1][0]
+        )
+        found = grow_branch(ready, np.eye(4), start)
         assert found.reason == "no further move is possible after 1 virtual view"
         assert found.expansions == 5
         assert found.moves[0].startswith("turn")
         # The best of the four dead ends is kept.
         alone = [rendered_pairs(ready.scene, ready.scoring_cameras(pose[None]), **SEEN)[1] for pose in turns]
-        start = found.pairs & 0
-        start |= rendered_pairs(ready.scene, ready.scoring_cameras(np.eye(4)[None]), **SEEN)[1][0]
         assert found.values[0] == max(int(coverage_gain(start, pairs[0])) for pairs in alone)
 
     @pytest.mark.parametrize("sign", [1, -1])
@@ -195,8 +196,7 @@ class TestGrowBranch:
         worths = sorted({*tried})
         assert len(tried) == len(worths) == 4
         assert tried == worths[::-sign]
-        at_start = ready.value.gain(seen, ready.seen(*ready.observe(np.eye(4)[None])))
-        assert at_start + sum(found.values) == pytest.approx(worths[-1])
+        assert sum(found.values) == pytest.approx(worths[-1])
 
     def test_a_spent_budget_keeps_the_best_path(self):
         found = branch(length=16, max_expansions=3)
@@ -244,11 +244,28 @@ class TestHoles:
         ).merged([found])
         assert len(state.branches) == 1
         assert state.gains == (0,)
-        # No training view has looked there: what the start itself sees counts as well.
         assert state.values == (ready.value.gain(coverage, found.seen),)
-        assert state.values[0] >= sum(found.values)
+        assert state.values[0] == pytest.approx(sum(found.values))
         # Seen into once, a hole is worth nothing more from there.
         assert ready.value.gain(state.known, found.seen) == 0
+
+    def test_what_the_real_start_shows_is_not_the_worth_of_virtual_views(self):
+        """It is not restored: neither its holes nor what lies beyond its mask is filled by it."""
+        ready, start, coverage = self.hole_alone()
+        (shown,) = ready.observe(start[None])
+        assert ready.value.gain(coverage, ready.seen(shown)) > 0
+        found = grow_branch(ready, start, coverage, START)
+        further = [ready.seen(view) for view in ready.observe(found.poses[1:])]
+        together = ready.value.beyond(coverage, union(ready.value, further, coverage))
+        np.testing.assert_array_equal(found.seen.row, together.row)
+        np.testing.assert_array_equal(found.seen.value, together.value)
+        known = coverage.copy()
+        for view, value in zip(further, found.values, strict=True):
+            assert ready.value.gain(known, view) == pytest.approx(value)
+            ready.value.add(known, view)
+        nowhere = replace(ready.freespace, occupancy=np.full_like(ready.freespace.occupancy, OCCUPIED))
+        stays = grow_branch(replace(ready, freespace=nowhere), start, coverage, START)
+        assert len(stays.seen.row) == stays.pairs.any() == 0
 
     def test_a_spent_budget_keeps_the_path_of_the_largest_value(self):
         ready, start, coverage = self.hole_alone()
