@@ -126,7 +126,7 @@ def absolute_trajectory_error(
             should already stand in the true frame.
 
     Raises:
-        ShapeError: for fewer than three poses, or different numbers of them.
+        ShapeError: for no poses, fewer than three that are to be aligned, or different numbers of them.
         NonFiniteError: for NaN or infinity.
         ConfigError: for an unknown alignment.
     """
@@ -183,6 +183,8 @@ def relative_pose_error(
 def _aligned(estimated: np.ndarray, truth: np.ndarray, alignment: Alignment) -> np.ndarray:
     if estimated.shape != truth.shape:
         raise ShapeError(f"{estimated.shape} estimated poses do not fit {truth.shape} true ones")
+    if len(truth) == 0:
+        raise ShapeError("there is no pose to compare")
     if alignment not in ("sim3", "se3", "none"):
         raise ConfigError(f"no alignment {alignment!r}; known: sim3, se3, none")
     for name, poses in (("estimated", estimated), ("true", truth)):

@@ -167,6 +167,9 @@ def test_bad_input_is_named() -> None:
         absolute_trajectory_error(broken, truth)
     with pytest.raises(ShapeError, match="three or more"):
         absolute_trajectory_error(truth[:2], truth[:2])
+    with pytest.raises(ShapeError, match="no pose to compare"):
+        absolute_trajectory_error(truth[:0], truth[:0], "none")
+    assert absolute_trajectory_error(truth[:1], truth[:1], "none").max == 0
     with pytest.raises(ShapeError, match="no two of 4 poses"):
         relative_pose_error(truth, truth, frames_apart=4)
     with pytest.raises(ConfigError, match="at least 1"):
