@@ -66,9 +66,9 @@ def observed_from_depth(
     """A depth test against every training frame.
 
     A point of a held-out frame is observed when it falls into a training image, inside its mask, and lies no
-    farther than that image's depth (the farthest of the four pixels round it, so that rounding at slanted
-    walls does not hide it). After each held-out frame it emits progress: there are as many tests as pairs of
-    frames.
+    farther than that image's depth (the farthest of the four pixels round it that are inside the mask, so
+    that rounding at slanted walls does not hide it). After each held-out frame it emits progress: there are
+    as many tests as pairs of frames.
 
     Args:
         cameras: all frames.
@@ -223,7 +223,7 @@ def _in_front(
         for dx in (-0.5, 0.5):
             row = np.clip(np.floor(v + dy).astype(int), 0, camera.height - 1)
             column = np.clip(np.floor(u + dx).astype(int), 0, camera.width - 1)
-            farthest = np.maximum(farthest, depth_mm[row, column])
+            farthest = np.maximum(farthest, np.where(mask[row, column], depth_mm[row, column], 0))
     result = np.zeros(len(points), dtype=bool)
     result[inside] = z[inside] <= farthest * (1 + tolerance_share) + tolerance_mm * (farthest > 0)
     return result

@@ -44,6 +44,22 @@ def test_what_a_training_frame_shows_outside_its_mask_is_not_observed() -> None:
     )
 
 
+def test_depth_beyond_the_edge_of_a_mask_shows_nothing_behind_the_tissue_beside_it() -> None:
+    K = np.tile([[20.0, 0, 8], [0, 20.0, 6], [0, 0, 1]], (2, 1, 1))
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    # A quarter of a pixel at the depth of the held-out frame, which looks through the training frame's wall.
+    poses[1, 0, 3] = 50 / 20 / 4
+    depth = np.full((2, 12, 16), 10, np.float32)
+    depth[0, :, 8:] = depth[0, :, 0] = 100
+    depth[1] = 50
+    mask = np.ones(depth.shape, dtype=bool)
+    mask[0, :, 8:] = False
+    frames = Cameras(K, poses, 16, 12), mask, depth, np.array([0]), np.array([1])
+    assert not observed_from_depth(*frames)[1, :, 2:].any()
+    mask[0] = True
+    assert observed_from_depth(*frames)[1, :, 7:15].all()
+
+
 def test_never_observed_is_told_of_held_out_pixels_with_depth_alone() -> None:
     shape = (3, 12, 16)
     # In metres: what is known is not told by how large it is.
@@ -112,7 +128,8 @@ class TestAgainstEveryPixelAlone:
                     # The four pixels whose centres are the corners of a square round the point.
                     rows = {min(max(int(np.floor(v - 0.5)) + d, 0), self.HEIGHT - 1) for d in (0, 1)}
                     columns = {min(max(int(np.floor(u - 0.5)) + d, 0), self.WIDTH - 1) for d in (0, 1)}
-                    farthest = max(float(depth[train, r, c]) for r in rows for c in columns)
+                    corners = [(train, r, c) for r in rows for c in columns]
+                    farthest = max(float(depth[at]) * bool(mask[at]) for at in corners)
                     if farthest > 0 and z <= farthest * (1 + share) + length:
                         seen[test, row, column] = True
         return seen
