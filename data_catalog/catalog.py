@@ -24,6 +24,7 @@ from data_catalog.folder_reader import Glance
 from data_catalog.folders import FolderDataset, find_reader, readers
 from data_catalog.footage import DICOM_SUFFIXES, VIDEO_SUFFIXES
 from data_catalog.phantom.dataset import PHANTOM
+from data_catalog.picture_crop import cropped_to_picture
 from data_catalog.pose_conventions import OPENCV
 from data_catalog.rendered_dataset import RenderedDataset
 from data_catalog.specular import with_specular
@@ -193,6 +194,7 @@ def read(source: Source | str | Path, config: IngestConfig | None = None) -> End
     stored = OPENCV if reader is None else reader.poses
     depth_unit = "" if reader is None else reader.depth_unit
     check_sequence(sequence, file=source.path or source.name, stored=stored, depth_unit=depth_unit)
+    sequence = cropped_to_picture(sequence, config)
     if config.scale_mm_per_unit is not None:
         sequence = _scaled(sequence, config.scale_mm_per_unit)
     # After the checks, which hold poses against all depth there is; what was observed is known by now.

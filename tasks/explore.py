@@ -44,7 +44,7 @@ def start(slot: Slot, scene: Ref, sequence: Ref, freespace: Ref, config: Explore
     slot.counts.update(renders=context.measured.renders)
 
 
-@stage("explore-branch", version=5)
+@stage("explore-branch", version=6)
 def branch(
     slot: Slot, scene: Ref, freespace: Ref, search: Ref, state: Ref, anchor: int, config: ExploreConfig
 ) -> None:

@@ -9,7 +9,7 @@ from tasks.stage import stage
 __all__ = ["freespace"]
 
 
-@stage("freespace", version=6)
+@stage("freespace", version=7)
 def freespace(slot: Slot, scene: Ref, surface: Ref, sequence: Ref, config: FreespaceConfig) -> None:
     """Carve the space the training views look through; writes `freespace/`."""
     from extrags.freespace import carve

@@ -108,6 +108,11 @@ class IngestConfig(StageConfig):
         description="of sources with poses and depth: mask what training frames show in front of the "
         "surface and other frames look through, such as instruments",
     )
+    crop_surround: bool = Field(
+        True,
+        description="of sources without poses, where no width is set: cut frames to the picture, where it "
+        "takes at most three quarters of them, as a round one in a wide frame does",
+    )
     match_light: bool = Field(
         True,
         description="where some training frames were recorded under another light, such as narrow-band "

@@ -12,11 +12,14 @@ from PIL import Image
 from data_catalog.catalog import read
 from data_catalog.inspection import inspect
 from data_catalog.readers.frames_folder import read_intrinsics
+from extrags.config import IngestConfig
 from extrags.errors import SourceError
 
 WIDTH, HEIGHT = 48, 32
 K = [[40.0, 0, 24], [0, 40.0, 16], [0, 0, 1]]
 PINHOLE = {"fx": 40, "fy": 40, "cx": 24, "cy": 16}
+
+WHOLE = IngestConfig(crop_surround=False)
 
 
 @pytest.fixture
@@ -112,7 +115,7 @@ class TestAFieldOfView:
         u, v = np.meshgrid(np.arange(200) + 0.5, np.arange(120) + 0.5)
         self.written(tmp_path, np.hypot(u - 110, v - 60) < 50)
         (tmp_path / "intrinsics.json").write_text(json.dumps({"field_of_view_deg": 70}))
-        found = read(tmp_path)
+        found = read(tmp_path, WHOLE)
         assert found.intrinsics == "given"
         np.testing.assert_allclose(found.K[0, :2, 2], [110, 60], atol=1.5)
         assert found.K[0, 0, 0] == pytest.approx(50 / np.tan(np.radians(35)), abs=3)
@@ -122,7 +125,7 @@ class TestAFieldOfView:
         self.written(tmp_path, np.hypot(u - 110, v - 60) < 50)
         stated = {"fx": 71, "fy": 71, "cx": 112, "cy": 58}
         (tmp_path / "intrinsics.json").write_text(json.dumps(stated))
-        np.testing.assert_array_equal(read(tmp_path).K[0], [[71, 0, 112], [0, 71, 58], [0, 0, 1]])
+        np.testing.assert_array_equal(read(tmp_path, WHOLE).K[0], [[71, 0, 112], [0, 71, 58], [0, 0, 1]])
 
     @pytest.mark.parametrize("name", ["fov", "hfov_deg", "Field_Of_View", "camera_angle_x"])
     def test_under_another_name_it_is_told_how_it_is_called(self, tmp_path, name) -> None:
