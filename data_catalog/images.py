@@ -55,6 +55,10 @@ _TOP_IS_BOTTOM = (3, 4, 7, 8)
 _TIFF_SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 DEPTH_SUFFIXES = (".npy", ".tiff", ".tif", ".png")
 _MASK_THRESHOLD = 127
+_COLORED_MODES = ("RGB", "RGBA", "P", "PA")
+_LEAST_CHROMA = 64
+"""Of 255: what a pixel of colour differs by between its channels at least."""
+_NAMED_COLORS = 4
 _LEAST_OPACITY = 128
 """Of 255: pixels below are more transparent than opaque."""
 _LOSSY_SUFFIXES = (".jpg", ".jpeg")
@@ -241,8 +245,9 @@ def read_mask(file: Path, *, frame: object = None) -> Bool[np.ndarray, "h w"]:
 
     Raises:
         SourceNotFoundError: there is no such file.
-        SourceError: the file is truncated or no image, has several values of which none is white, or all that
-            differs is how opaque it is.
+        SourceError: the file is truncated or no image, has several values of which none is white, has
+            labels in several colours or in two of which none is black, or all that differs is how opaque
+            it is.
     """
     from PIL import Image
 
@@ -250,6 +255,9 @@ def read_mask(file: Path, *, frame: object = None) -> Bool[np.ndarray, "h w"]:
         image.load()
         values = np.asarray(image.convert("L"))
         opacity = np.asarray(image.convert("LA"))[..., 1] if image.has_transparency_data else None
+        colors = np.asarray(image.convert("RGB")) if image.mode in _COLORED_MODES else None
+    if colors is not None and not _is_lossy(file):
+        _check_mask_colors(colors, file, frame)
     found = np.unique(values)
     if len(found) == 1 and opacity is not None and len(np.unique(opacity)) > 1:
         raise SourceError(
@@ -270,6 +278,30 @@ def read_mask(file: Path, *, frame: object = None) -> Bool[np.ndarray, "h w"]:
             field="mask",
         )
     return np.asarray(values > 0)
+
+
+def _check_mask_colors(colors: UInt8[np.ndarray, "h w 3"], file: Path, frame: object) -> None:
+    """Refuse labels in colours, unless they are one colour on black: how bright a label is tells nothing.
+
+    Colours count as different where a channel is bright in one and dark in the other, so that shades at
+    edges, which resizing makes, are none.
+
+    Raises:
+        SourceError: several colours, or two of which none is black.
+    """
+    if not (np.ptp(colors, axis=-1) >= _LEAST_CHROMA).any():
+        return
+    found = np.unique((colors > _MASK_THRESHOLD) @ np.array([1, 2, 4]))
+    if len(found) > 2 or (len(found) == 2 and found[0] > 0):
+        several = np.unique(colors.reshape(-1, 3), axis=0)
+        raise SourceError(
+            f"labels in {len(several)} colours (the first in red, green and blue: "
+            f"{', '.join(str(tuple(map(int, color))) for color in several[:_NAMED_COLORS])}); "
+            "expected white where tissue is, and black, or two labels of which one is black",
+            file=file,
+            frame=frame,
+            field="mask",
+        )
 
 
 def _is_lossy(file: Path) -> bool:

@@ -247,6 +247,27 @@ class TestMasks:
         with pytest.raises(SourceError, match=r"field mask: 3 values, of which 2 of 255 is the largest"):
             read_mask(written(tmp_path / "a.png", labels))
 
+    @pytest.mark.parametrize("palette", [False, True])
+    def test_labels_in_colours_are_refused(self, tmp_path: Path, palette: bool) -> None:
+        """Tissue and instrument were both bright, so that nothing was masked."""
+        image = Image.fromarray(self.LABELS, mode="P")
+        image.putpalette([255, 114, 114, 170, 255, 0])
+        (image if palette else image.convert("RGB")).save(tmp_path / "a.png")
+        with pytest.raises(
+            SourceError, match=r"a\.png, frame 7, field mask: labels in 2 colours .*\(170, 255, 0\), \(255"
+        ):
+            read_mask(tmp_path / "a.png", frame=7)
+
+    @pytest.mark.parametrize("color", [(255, 255, 0), (0, 0, 255), (255, 255, 255)])
+    def test_one_colour_on_black(self, tmp_path: Path, color: tuple[int, int, int]) -> None:
+        labelled = Image.fromarray(self.LABELS[..., None] * np.array(color, np.uint8))
+        labelled.save(tmp_path / "a.png")
+        np.testing.assert_array_equal(read_mask(tmp_path / "a.png"), self.LABELS > 0)
+        if color[0] == 255:
+            # Shades between the two are no third label.
+            labelled.resize((60, 40), Image.Resampling.BILINEAR).save(tmp_path / "b.png")
+            assert 0.1 < read_mask(tmp_path / "b.png").mean() < 0.9
+
     def test_opacity_is_no_mask(self, tmp_path: Path) -> None:
         image = np.full((20, 30, 4), 255, np.uint8)
         image[..., 3] = 255 * self.LABELS
