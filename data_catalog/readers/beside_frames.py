@@ -43,7 +43,9 @@ _COLOR = re.compile(r"colou?rs?|rgb|bgr|images?|img|im|frames?|framebuffer|buffe
 
 _DEPTH_FOLDERS = ("depth", "depths", "gt_depth", "depth_gt", "disparity", "disparities")
 _MASK_FOLDERS = ("mask", "masks", "gt_masks")
-_POSES = re.compile(r"(?<![a-z])(pose|traj|groundtruth|extrinsic|transforms|savedposition|savedrotation)")
+_POSES = re.compile(
+    r"(?<![a-z])(pose|traj|groundtruth|extrinsic|transforms|savedposition|savedrotation)|trajector(y|ies)"
+)
 _POSE_SUFFIXES = (".txt", ".csv", ".json", ".npy", ".npz", ".yaml", ".yml", ".log", ".mat", ".tum")
 _POSE_NAMES = ("sparse", "colmap", "cameras.txt", "cameras.bin", "images.txt", "images.bin")
 _SINUS_POSES = ("motion.yaml", "structure.ply")

@@ -128,6 +128,7 @@ class TestPosesAndDepth:
             ("", ["frame_0001.pose.txt"]),
             ("images", ["poses/"]),
             ("rgb", ["camera_poses.npy", "trajectory.csv"]),
+            ("rgb", ["CameraTrajectory.txt", "KeyFrameTrajectory.txt"]),
             ("images", ["sparse/"]),
         ],
     )
