@@ -58,7 +58,7 @@ READERS: tuple[FolderReader, ...] = (
 _registered: list[FolderReader] = []
 _OTHER_IMAGES = (
     *(".gif", ".jp2", ".j2k", ".avif", ".heic", ".heif", ".exr", ".hdr", ".pgm", ".ppm", ".pnm", ".tga"),
-    *(".dng", ".npy", ".npz"),
+    *(".jxl", ".dng", ".npy", ".npz"),
 )
 """Images that are not read as frames."""
 _FOLDERS_ABOVE = 3

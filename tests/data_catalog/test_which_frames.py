@@ -73,6 +73,11 @@ class TestNotRecognised:
         with pytest.raises(SourceNotFoundError, match=r"folder: 3 \.gif files, which are not read; expected"):
             resolve(tmp_path)
 
+    def test_files_of_jpeg_xl_are_named(self, tmp_path) -> None:
+        (tmp_path / "0.jxl").write_bytes(b"\xff\x0a")
+        with pytest.raises(SourceNotFoundError, match=r"folder: 1 \.jxl files, which are not read; expected"):
+            resolve(tmp_path)
+
 
 class TestVideos:
     @pytest.fixture
