@@ -361,6 +361,16 @@ class TestDepthScale:
         check_depth_scale(replace(clip, depth_mm=(clip.depth_mm * lengths).astype(np.float32)), file="poses")
         assert not caplog.messages
 
+    @pytest.mark.parametrize("constant", [1.0, 300.0, 5e4])
+    def test_inverse_depth_is_refused(self, clip, constant) -> None:
+        """Of disparity no factor fits, and where it is small nothing meets: it was read as it stood."""
+        disparity = np.divide(
+            constant, clip.depth_mm, out=np.zeros_like(clip.depth_mm), where=clip.depth_mm > 0
+        )
+        with pytest.raises(SourceError, match=r"depth is inverse, .* but only by 0\.\d% when a") as caught:
+            check_depth_scale(replace(clip, depth_mm=disparity), file="poses")
+        assert caught.value.field == "depth_mm"
+
     def test_wrong_positions_are_no_unit(self, clip) -> None:
         """Of cameras that move little, any large factor fits as well as none that moves."""
         calm = clip.world_from_camera.copy()
