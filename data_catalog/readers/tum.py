@@ -17,7 +17,8 @@ A frame gets the pose and the depth nearest in time, at most 0.02 s away, each o
 at most, the nearest pairs first; of poses and depth at more than 100 Hz only the two before and the two after
 the frame. Frames that lack one of them, as before the tracker began, are left out with a warning, and so are
 images that are listed and absent; where these are more than `ingest.max_absent_share`, the source is refused.
-Frames are in the order of time.
+Frames are in the order of time. Trajectories of SLAM with a single camera, whose unit is arbitrary, are taken
+for metres; where no depth is there to contradict it, the log says so.
 
 Source: Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012, and "File formats"
 and `associate.py` of its web page.
@@ -112,6 +113,12 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
         folder, width, height, is_used=config.calibration is None, images=colours[0].file.parent
     )
     lens, mask_file = Lens.pinhole(K, width, height), mask_beside(folder)
+    if len(poses) and not depths:
+        logger.warning(
+            "%s: lengths are taken for metres, and there is no depth that would contradict it. A trajectory "
+            'of a single camera has no unit: give it as poses.json with "length_unit": "arbitrary"',
+            folder / _POSES,
+        )
     if mask_file is None:
         tell_about_folders(folder, "mask", f"one {MASK_FILE} holds for all frames")
     return SourceFrames(

@@ -133,6 +133,16 @@ class TestReading:
         assert sequence.depth_mm is None
         assert sequence.world_from_camera is not None
 
+    @pytest.mark.parametrize(
+        ("absent", "told"), [("depth.txt", True), ("groundtruth.txt", False), ("", False)]
+    )
+    def test_metres_that_nothing_tells_are_named(self, folder, caplog, absent, told) -> None:
+        """Monocular SLAM writes this layout, too, in a unit of its own."""
+        if absent:
+            (folder / absent).unlink()
+        read(folder)
+        assert ("groundtruth.txt: lengths are taken for metres" in caplog.text) == told
+
     def test_a_calibration_file_instead_of_intrinsics(self, folder, tmp_path, clip) -> None:
         removed("intrinsics.json")(folder)
         with pytest.raises(
