@@ -32,6 +32,7 @@ from data_catalog.readers import (
     tum,
     video,
 )
+from data_catalog.readers.beside_frames import what_would_be_lost
 from extrags.config import IngestConfig
 from extrags.errors import ConfigError, SourceError, SourceNotFoundError
 from extrags.frame_names import COLOR_SUFFIXES, natural_key
@@ -220,6 +221,7 @@ def _what_is_there(path: Path) -> str:
         more = f" and {len(holding) - _NAMED_FILES} more" if len(holding) > _NAMED_FILES else ""
         return (
             f", but images in {', '.join(holding[:_NAMED_FILES])}{more}: give the path of the folder to read"
+            f"{what_would_be_lost(path)}"
         )
     others = Counter(file.suffix.lower() for file in path.iterdir() if file.suffix.lower() in _OTHER_IMAGES)
     if others:

@@ -23,6 +23,7 @@ __all__ = [
     "tell_about_other_names",
     "tell_about_pictures",
     "tell_what_is_not_read",
+    "what_would_be_lost",
 ]
 
 logger = logging.getLogger(__name__)
@@ -167,19 +168,47 @@ def tell_about_other_names(files: Sequence[Path]) -> None:
 
 def tell_what_is_not_read(folder: Path) -> None:
     """Warn of masks, depth and poses that lie beside frames without anything that says how they belong."""
-    names = sorted(file.name for file in folder.iterdir() if not file.name.startswith("."))
-    folders = [name for name in names if (folder / name).is_dir()]
-    for name in folders:
-        if name.lower() in _MASK_FOLDERS:
+    names = _names(folder)
+    for name in names:
+        if name.lower() in _MASK_FOLDERS and (folder / name).is_dir():
             _tell(f"{folder / name} is not read; of plain frames, one mask.png holds for all")
-    found = [f"{name}/" for name in folders if name.lower() in _DEPTH_FOLDERS]
-    found += [f"{name}/" if name in folders else name for name in names if _tells_poses(folder / name)]
+    found = _poses_and_depth(folder)
     if found:
-        more = f" and {len(found) - _NAMED_FILES} more" if len(found) > _NAMED_FILES else ""
         _tell(
-            f"{folder}: read without poses and depth; not read are {', '.join(found[:_NAMED_FILES])}{more}. "
-            f"To have poses and depth read, give {_READ_WITH_POSES}{_of_sinus_set(names)}"
+            f"{folder}: read without poses and depth; not read are {', '.join(found[:_NAMED_FILES])}"
+            f"{_and_more(found)}. To have poses and depth read, give {_READ_WITH_POSES}{_of_sinus_set(names)}"
         )
+
+
+def what_would_be_lost(folder: Path) -> str:
+    """Of a folder whose frames lie in another one within: poses and depth beside that, as a clause, or empty.
+
+    Args:
+        folder: that no reader recognises.
+    """
+    found = _poses_and_depth(folder)
+    if not found:
+        return ""
+    return (
+        f", which is read without {', '.join(found[:_NAMED_FILES])}{_and_more(found)}; "
+        f"to have poses and depth read, give {_READ_WITH_POSES}"
+    )
+
+
+def _poses_and_depth(folder: Path) -> list[str]:
+    """Names in a folder that tell of depth or poses of frames; those of folders end with a slash."""
+    names = _names(folder)
+    folders = [name for name in names if (folder / name).is_dir()]
+    found = [f"{name}/" for name in folders if name.lower() in _DEPTH_FOLDERS]
+    return found + [f"{name}/" if name in folders else name for name in names if _tells_poses(folder / name)]
+
+
+def _names(folder: Path) -> list[str]:
+    return sorted(file.name for file in folder.iterdir() if not file.name.startswith("."))
+
+
+def _and_more(found: Sequence[str]) -> str:
+    return f" and {len(found) - _NAMED_FILES} more" if len(found) > _NAMED_FILES else ""
 
 
 def tell_about_folders(folder: Path, field: Literal["depth", "mask"], instead: str) -> None:

@@ -67,6 +67,18 @@ class TestNotRecognised:
         ):
             resolve(tmp_path)
 
+    def test_poses_beside_the_folder_to_give_are_named(self, tmp_path) -> None:
+        """In the folder that the error names, nothing tells of them any more."""
+        for name in ("color", "depth"):
+            write_frames(tmp_path / name, 5)
+        (tmp_path / "pose").mkdir()
+        (tmp_path / "traj.txt").write_text("1 0 0 0\n")
+        with pytest.raises(
+            SourceNotFoundError,
+            match=r"to read, which is read without depth/, pose/, traj\.txt; to have .*, give a poses\.json",
+        ):
+            resolve(tmp_path)
+
     def test_images_of_other_formats_are_named(self, tmp_path) -> None:
         for number in range(3):
             Image.new("RGB", (48, 42)).save(tmp_path / f"{number}.GIF")
