@@ -80,7 +80,7 @@ def gallery(given: argparse.Namespace) -> int:
 
     Raises:
         ConfigError: when the images cannot be as small as is asked for.
-        StoreError: when there is no such store, no such run, or something of one is gone.
+        StoreError: when there is no such store, no run of one of the patterns, or something of one is gone.
     """
     from flows.environment import prepare
 
@@ -91,10 +91,17 @@ def gallery(given: argparse.Namespace) -> int:
     prepare(store.state, debug=given.debug, looks=True)
     from flows.recorded_runs import gallery_run, last_runs, nearest_on_record
 
-    chosen = last_runs(store, given.patterns, methods=items(given.methods), profiles=items(given.profiles))
-    if not chosen:
-        wanted = f" of {', '.join(given.patterns)}" if given.patterns else ""
-        near = nearest_on_record(store, given.patterns)
+    methods, profiles = items(given.methods), items(given.profiles)
+    chosen = last_runs(store, given.patterns, methods=methods, profiles=profiles)
+    # One by one: a page without a sequence that was asked for would pass for one with all of them.
+    absent = [
+        pattern
+        for pattern in given.patterns
+        if not last_runs(store, [pattern], methods=methods, profiles=profiles)
+    ]
+    if absent or not chosen:
+        wanted = f" of {', '.join(absent)}" if absent else ""
+        near = nearest_on_record(store, absent)
         raise StoreError(f"no finished run{wanted} is on record in {store.root}{near}")
     from extrags.report.gallery import build_gallery
 

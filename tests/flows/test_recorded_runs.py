@@ -146,17 +146,18 @@ def test_a_misspelt_sequence_is_answered_with_the_nearest(
     assert f"; did you mean {SEQUENCE}?" in capsys.readouterr().err
 
 
-def test_a_leaderboard_lacks_no_sequence_in_silence(
-    store: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(("verb", "name"), [("leaderboard", "board.html"), ("gallery", "folder")])
+def test_no_sequence_is_left_out_in_silence(
+    verb: str, name: str, store: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    page = tmp_path / "board.html"
+    page = tmp_path / name
     misspelt = SEQUENCE.replace("phantom", "phamtom")
     given = ["--store", store.root, "--output", str(page)]
-    assert main(["leaderboard", SEQUENCE, misspelt, *given]) != 0
-    assert f"no run of {misspelt} is on record" in (told := capsys.readouterr().err)
+    assert main([verb, SEQUENCE, misspelt, *given]) != 0
+    assert f"run of {misspelt} is on record" in (told := capsys.readouterr().err)
     assert f"; did you mean {SEQUENCE}?" in told
     assert not page.exists()
-    assert main(["leaderboard", SEQUENCE, "phantom/*", *given]) == 0
+    assert main([verb, SEQUENCE, "phantom/*", *given]) == 0
     assert page.exists()
 
 
