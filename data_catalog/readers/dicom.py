@@ -98,7 +98,10 @@ class DicomFile:
             )
         if self._announced < 2:
             raise SourceError(
-                "a single frame; expected a multi-frame file", file=file, field="NumberOfFrames"
+                "a single frame; expected a multi-frame file. A series of such files is read as a folder of "
+                "pictures (PNG, TIFF, ...), one of each",
+                file=file,
+                field="NumberOfFrames",
             )
         colors = str(header.get("PhotometricInterpretation"))
         if colors not in _COLORS:
