@@ -53,6 +53,9 @@ DISAGREEING_SHARE = 0.5
 LEAST_WEIGHT = 0.1
 """No frame loses all weight: it may be the only one that shows some of the surface."""
 
+_TOLD_WEIGHT = 0.995
+"""Weights of this or more are shown as 100 %: nothing is told of them."""
+
 
 @dataclass(frozen=True)
 class FrameWeights(Storable):
@@ -81,7 +84,7 @@ class FrameWeights(Storable):
         blurred = [
             f"frame {self.names[position]} is blurred: {self.sharpness[position]:.0%} of the detail that "
             f"others show there" + (f", it counts {self.weights[position]:.0%}" if self.applied else "")
-            for position in np.flatnonzero(self.weights < 1).tolist()
+            for position in np.flatnonzero(self.weights < _TOLD_WEIGHT).tolist()
         ]
         return blurred + [
             f"frame {self.names[position]} disagrees with the others: {self.displaced[position]:.0%} of "

@@ -225,6 +225,20 @@ class TestWithout:
             ComparedFrames(replace(plane, depth_mm=None), plane.train)
 
 
+def test_a_frame_that_counts_fully_as_shown_is_not_named() -> None:
+    """A warning called it blurred and said that it counts 100 %."""
+    shown = FrameWeights(
+        names=("a.png", "b.png", "c.png"),
+        sharpness=np.array([0.84, 0.83, 1.0]),
+        displaced=np.zeros(3),
+        weights=np.array([0.9957, 0.98, 1.0]),
+        applied=True,
+    )
+    assert shown.statements == [
+        "frame b.png is blurred: 83% of the detail that others show there, it counts 98%"
+    ]
+
+
 class TestReconstruct:
     CONFIG = CoarseConfig(
         iterations=30,
