@@ -23,6 +23,7 @@ from data_catalog.detail import DetailSize, source_detail
 from data_catalog.folder_reader import Glance
 from data_catalog.folders import FolderDataset, find_reader, readers
 from data_catalog.footage import DICOM_SUFFIXES, VIDEO_SUFFIXES
+from data_catalog.mask_findings import tell_of_inverted_masks
 from data_catalog.phantom.dataset import PHANTOM
 from data_catalog.picture_crop import cropped_to_picture
 from data_catalog.pose_conventions import OPENCV
@@ -194,6 +195,7 @@ def read(source: Source | str | Path, config: IngestConfig | None = None) -> End
     stored = OPENCV if reader is None else reader.poses
     depth_unit = "" if reader is None else reader.depth_unit
     check_sequence(sequence, file=source.path or source.name, stored=stored, depth_unit=depth_unit)
+    tell_of_inverted_masks(sequence)
     sequence = cropped_to_picture(sequence, config)
     if config.scale_mm_per_unit is not None:
         sequence = _scaled(sequence, config.scale_mm_per_unit)

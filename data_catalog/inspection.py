@@ -244,7 +244,8 @@ class _HeardWarnings(logging.Handler):
             self.messages.append(record.getMessage())
         else:
             field = getattr(record, "field", "K")
-            self.findings.append(warning(topic, record.getMessage(), field=field))
+            found = warning(topic, record.getMessage(), field=field)
+            self.findings.append(found.model_copy(update={"kind": getattr(record, "kind", "warning")}))
 
     def __enter__(self) -> _HeardWarnings:
         for name in LOGGERS:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Iterator
 
 import numpy as np
@@ -10,7 +11,10 @@ from jaxtyping import Bool
 from data_catalog.findings import Finding, warning
 from extrags.sequence import EndoscopicSequence
 
-__all__ = ["mask_findings"]
+__all__ = ["mask_findings", "tell_of_inverted_masks"]
+
+_log = logging.getLogger(__name__)
+_POLARITY = "mask polarity"
 
 _NARROW_MASK = 0.3
 """Masks that leave more out are rare: round pictures fill over half of their images."""
@@ -32,7 +36,7 @@ def mask_findings(sequence: EndoscopicSequence) -> Iterator[Finding]:
     if lit_inside < 0.3 and lit_outside > 0.6:
         yield Finding(
             kind="error",
-            topic="mask polarity",
+            topic=_POLARITY,
             sentence=f"{1 - lit_inside:.0%} of the pixels that the mask keeps are dark and {lit_outside:.0%} "
             "of those it leaves out are lit: the mask is inverted. Expected white on tissue",
             field="mask",
@@ -43,7 +47,7 @@ def mask_findings(sequence: EndoscopicSequence) -> Iterator[Finding]:
         if known_inside < 0.2 and known_outside > 0.8:
             yield Finding(
                 kind="error",
-                topic="mask polarity",
+                topic=_POLARITY,
                 sentence=f"depth is known for {known_inside:.0%} of the pixels that the mask keeps and for "
                 f"{known_outside:.0%} of those it leaves out: the mask is inverted. Expected white on tissue",
                 field="mask",
@@ -51,7 +55,7 @@ def mask_findings(sequence: EndoscopicSequence) -> Iterator[Finding]:
             return
     if kept.mean() < _NARROW_MASK and lit_outside > 0.6:
         yield warning(
-            "mask polarity",
+            _POLARITY,
             f"the mask keeps {kept.mean():.0%} of the pixels, and {lit_outside:.0%} of those it leaves out "
             "are lit. Is it inverted? Expected white on tissue",
             field="mask",
@@ -65,6 +69,18 @@ def mask_findings(sequence: EndoscopicSequence) -> Iterator[Finding]:
             frame=sequence.frame_name(index),
             field="mask",
         )
+
+
+def tell_of_inverted_masks(sequence: EndoscopicSequence) -> None:
+    """Warn of masks that look inverted: training and figures would be of what they keep, without a word.
+
+    Args:
+        sequence: whose masks they are.
+    """
+    for finding in mask_findings(sequence):
+        if finding.topic == _POLARITY:
+            told = {"topic": finding.topic, "field": finding.field, "kind": finding.kind}
+            _log.warning("%s: %s", sequence.name, finding.sentence, extra=told)
 
 
 def _shares(sequence: EndoscopicSequence, frames: Iterable[Bool[np.ndarray, "h w"]]) -> tuple[float, float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 
 import cv2
@@ -370,6 +371,20 @@ class TestMasksBeforePoses:
         with pytest.raises(SourceError, match="where the mask leaves it out: the mask is inverted") as caught:
             read(posed_folder)
         assert caught.value.field == "mask"
+
+    def test_reading_tells_of_one_that_looks_inverted(self, posed_folder, caplog) -> None:
+        """Whoever does not ask for a check trains on the instruments, and measures them."""
+        white = np.zeros((40, 48), dtype=bool)
+        white[20:, 24:] = True
+        self.masked(posed_folder, ~white)
+        read(posed_folder)
+        assert "mask" not in caplog.text
+        shutil.rmtree(posed_folder / "mask")
+        self.masked(posed_folder, white)
+        read(posed_folder)
+        assert "the mask keeps 25% of the pixels, and" in caplog.text
+        (found,) = (item for item in inspect(posed_folder).findings if item.topic == "mask polarity")
+        assert (found.kind, found.field) == ("warning", "mask")
 
     def test_wrong_poses_are_found_with_a_mask(self, posed_folder, edit_poses) -> None:
         white = np.ones((40, 48), dtype=bool)
