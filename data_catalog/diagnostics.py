@@ -37,6 +37,10 @@ _FEWEST_NUMBERED = 7
 _CONVINCING_SUPPORT = 0.82
 _CLEARLY_LESS = 0.5
 _POOR_SUPPORT = 0.4
+# Of the logarithm of red over green, or blue over green. Neighbours in recordings of one light differ by 0.15
+# at most in the catalogue; narrow-band light divides the red of tissue by two. What is matched while a source
+# is read (extrags.switched_light) jumps no longer.
+_COLOR_JUMP = 0.35
 _EXPOSURE_JUMP = 0.5
 _EXPOSURE_DEVIATIONS = 8.0
 _MIN_BASELINE_SHARE = 0.02
@@ -206,6 +210,32 @@ def _exposure(sequence: EndoscopicSequence) -> Iterator[Finding]:
             f"{np.exp(step):.2f} times as bright as the frame before ({len(jumps)} such jumps; neighbours "
             f"usually differ by {np.exp(np.median(np.abs(values))) - 1:.0%}). Fix exposure and gain when "
             "recording, or keep the exposure per frame switched on (coarse.light.enabled)",
+            frame=sequence.frame_name(frame),
+            field="rgb",
+        )
+
+
+def _light(sequence: EndoscopicSequence) -> Iterator[Finding]:
+    """Sudden changes of colour between neighbours, as where narrow-band light is switched on."""
+    shown = _brightness(sequence) >= _BLACK
+    frames = zip(sequence.rgb, sequence.mask, strict=True)
+    means = np.array([image[mask].mean(0) if mask.any() else np.ones(3) for image, mask in frames])
+    hue = np.log(np.maximum(means[:, [0, 2]], 1.0) / np.maximum(means[:, 1:2], 1.0))
+    steps = [(k, hue[k] - hue[j]) for j, k in _neighbours(sequence) if shown[j] and shown[k]]
+    if len(steps) < 4:
+        return
+    sizes = np.array([np.abs(step).max() for _, step in steps])
+    limit = max(_COLOR_JUMP, _EXPOSURE_DEVIATIONS * float(np.median(sizes)))
+    jumps = [step for step, size in zip(steps, sizes, strict=True) if size > limit]
+    if jumps:
+        frame, step = jumps[0]
+        red, blue = np.exp(step)
+        yield warning(
+            "colour jump",
+            f"against green, red is {red:.2f} and blue {blue:.2f} times as bright as in the frame before "
+            f"({len(jumps)} such jumps; neighbours usually differ by {np.expm1(np.median(sizes)):.0%}), as "
+            "where the light is switched, to narrow bands for instance, and too few features tell how colours "
+            "of both belong together: a scene has one colour of each surface. Give frames of one light alone",
             frame=sequence.frame_name(frame),
             field="rgb",
         )
@@ -472,6 +502,7 @@ _CHECKS: tuple[_Check, ...] = (
     _order,
     _images,
     _exposure,
+    _light,
     mask_findings,
     _intrinsics,
     _count,

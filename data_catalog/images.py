@@ -58,6 +58,8 @@ _MASK_THRESHOLD = 127
 _COLORED_MODES = ("RGB", "RGBA", "P", "PA")
 _LEAST_CHROMA = 64
 """Of 255: what a pixel of colour differs by between its channels at least."""
+_SAME_COLOR = 0.95
+"""Cosine of the angle between colours, from which on one is a shade of the other."""
 _NAMED_COLORS = 4
 _LEAST_OPACITY = 128
 """Of 255: pixels below are more transparent than opaque."""
@@ -246,8 +248,7 @@ def read_mask(file: Path, *, frame: object = None) -> Bool[np.ndarray, "h w"]:
     Raises:
         SourceNotFoundError: there is no such file.
         SourceError: the file is truncated or no image, has several values of which none is white, has
-            labels in several colours or in two of which none is black, or all that differs is how opaque
-            it is.
+            labels in several colours, or all that differs is how opaque it is.
     """
     from PIL import Image
 
@@ -283,17 +284,18 @@ def read_mask(file: Path, *, frame: object = None) -> Bool[np.ndarray, "h w"]:
 def _check_mask_colors(colors: UInt8[np.ndarray, "h w 3"], file: Path, frame: object) -> None:
     """Refuse labels in colours, unless they are one colour on black: how bright a label is tells nothing.
 
-    Colours count as different where a channel is bright in one and dark in the other, so that shades at
-    edges, which resizing makes, are none.
+    Shades of one colour, which resizing makes at edges, are none of their own.
 
     Raises:
-        SourceError: several colours, or two of which none is black.
+        SourceError: several colours, or one beside white.
     """
     if not (np.ptp(colors, axis=-1) >= _LEAST_CHROMA).any():
         return
-    found = np.unique((colors > _MASK_THRESHOLD) @ np.array([1, 2, 4]))
-    if len(found) > 2 or (len(found) == 2 and found[0] > 0):
-        several = np.unique(colors.reshape(-1, 3), axis=0)
+    several = np.unique(colors.reshape(-1, 3), axis=0)
+    bright = several[several.max(1) >= _LEAST_CHROMA].astype(np.float64)
+    bright /= np.linalg.norm(bright, axis=1, keepdims=True)
+    # What is left of a shade is rounded: the brightest of all tells the colour.
+    if (bright @ bright[np.argmax(several[several.max(1) >= _LEAST_CHROMA].sum(1))] < _SAME_COLOR).any():
         raise SourceError(
             f"labels in {len(several)} colours (the first in red, green and blue: "
             f"{', '.join(str(tuple(map(int, color))) for color in several[:_NAMED_COLORS])}); "

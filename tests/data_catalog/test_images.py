@@ -258,7 +258,7 @@ class TestMasks:
         ):
             read_mask(tmp_path / "a.png", frame=7)
 
-    @pytest.mark.parametrize("color", [(255, 255, 0), (0, 0, 255), (255, 255, 255)])
+    @pytest.mark.parametrize("color", [(255, 255, 0), (0, 0, 255), (255, 150, 0), (255, 255, 255)])
     def test_one_colour_on_black(self, tmp_path: Path, color: tuple[int, int, int]) -> None:
         labelled = Image.fromarray(self.LABELS[..., None] * np.array(color, np.uint8))
         labelled.save(tmp_path / "a.png")

@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from data_catalog.checks import check_depth_scale, check_sequence
-from data_catalog.diagnostics import _exposure, _images, diagnose
+from data_catalog.diagnostics import _exposure, _images, _light, diagnose
 from data_catalog.inspection import contact_sheet, facts, inspect
 from data_catalog.matches import FrameMatches, match_neighbours, pose_support
 from extrags.cameras import invert_poses, pixel_rays
@@ -325,6 +325,24 @@ def test_all_that_is_corrected_is_told(clip, tmp_path) -> None:
     told = inspect(tmp_path)
     assert [(finding.topic, finding.field) for finding in told.findings] == [("light", "rgb")]
     assert not told.ok
+
+
+def test_light_of_another_colour_is_told(clip) -> None:
+    """Narrow-band light among white: one surface has two colours, which no exposure explains."""
+    assert not list(_light(clip))
+    rgb = clip.rgb.copy()
+    rgb[4:7, ..., 0] //= 3
+    (found,) = _light(replace(clip, rgb=rgb))
+    assert (found.topic, found.frame, found.field) == ("colour jump", clip.frame_name(4), "rgb")
+    assert "(2 such jumps; neighbours usually" in found.sentence
+    # Brighter and darker light of the same colour is a matter of exposure.
+    assert not list(
+        _light(
+            replace(
+                clip, rgb=np.where(np.arange(len(clip))[:, None, None, None] > 4, clip.rgb // 2, clip.rgb)
+            )
+        )
+    )
 
 
 def test_black_frames_are_neither_repeats_nor_jumps_of_exposure(clip) -> None:
