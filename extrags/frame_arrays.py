@@ -37,7 +37,7 @@ def sequence_from_arrays(
     """A sequence of pinhole frames from arrays, with the checks that every reader's sequence passes.
 
     What numbers alone do not tell is not checked: OpenGL axes, poses from world to camera, or depth in
-    another unit than poses; readers refuse those where frames have depth.
+    another unit than poses or inverse; readers refuse those where frames have depth.
 
     Args:
         rgb: colours as the camera encoded them: 8-bit, or floats in [0, 1], which are rounded to 8 bits.
