@@ -235,7 +235,8 @@ def _light(sequence: EndoscopicSequence) -> Iterator[Finding]:
             f"against green, red is {red:.2f} and blue {blue:.2f} times as bright as in the frame before "
             f"({len(jumps)} such jumps; neighbours usually differ by {np.expm1(np.median(sizes)):.0%}), as "
             "where the light is switched, to narrow bands for instance, and too few features tell how the "
-            "colours of both belong together: a scene has one colour of each surface. Give frames of one light alone",
+            "colours of both belong together: a scene has one colour of each surface. Give frames of one "
+            "light alone",
             frame=sequence.frame_name(frame),
             field="rgb",
         )
