@@ -134,7 +134,9 @@ def fuse_surface(
     if not len(cameras):
         raise CaptureError("no views to fuse the surface from")
     views, depth = rendered_depth(scene, cameras, config, masks=masks)
-    return fuse_depth(views, depth, config)
+    mesh = fuse_depth(views, depth, config)
+    _log.info("surface: %d vertices, %d triangles", len(mesh.vertices), len(mesh.triangles))
+    return mesh
 
 
 def rendered_depth(
@@ -256,9 +258,7 @@ def fuse_depth(cameras: Cameras, depth_mm: Float[np.ndarray, "c h w"], config: S
         extracted.vertex.positions.numpy() * np.float32(unit),
         extracted.triangle.indices.numpy().astype(np.int64),
     )
-    mesh = _without_small_clusters(vertices, triangles, config.min_cluster_triangles)
-    _log.info("surface: %d vertices, %d triangles", len(mesh.vertices), len(mesh.triangles))
-    return mesh
+    return _without_small_clusters(vertices, triangles, config.min_cluster_triangles)
 
 
 def _fusing_unit(typical_far_mm: float) -> float:

@@ -145,6 +145,13 @@ def _value_text(value: float) -> str:
     return f"{value:.0f}" if float(value).is_integer() and abs(value) < 1e9 else f"{value:.4g}"
 
 
+def _metric_text(metric: MetricRecorded) -> str:
+    """`judged_gain_over_classical_db` in words, its unit behind the number."""
+    words = metric.name.split("_")
+    unit = " dB" if words[-1] == "db" else ""
+    return f"{' '.join(words[:-1] if unit else words)} {_value_text(metric.value)}{unit}"
+
+
 class Pace:
     """How fast loops go, by sequence and stage; the owner sees to it that one thread asks at a time."""
 
@@ -267,7 +274,7 @@ def reporting(label: str, stage: str, time_limit_s: float | None = None) -> Iter
             detail = "  ".join(f"{name} {_value_text(value)}" for name, value in event.values.items())
             notify(StageProgress(label, stage, "running", event.done, event.total, detail))
         elif isinstance(event, MetricRecorded):
-            notify(StageProgress(label, stage, "running", detail=f"{event.name} {_value_text(event.value)}"))
+            notify(StageProgress(label, stage, "running", detail=_metric_text(event)))
 
     with subscribed(receive):
         yield

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from extrags.errors import SourceNotFoundError, StoreError, UnknownSequenceError, reason_of
 from extrags.output_files import whole_file
 from flows.commands.common import counted, set_up_logging, write_json
-from flows.commands.options import Parser, add_json, add_sequence, add_settings, add_verb
+from flows.commands.options import Parser, add_json, add_profile, add_sequence, add_settings, add_verb
 from flows.commands.outputs import output_file
 
 if TYPE_CHECKING:
@@ -34,6 +34,7 @@ def add_arguments(parser: Parser) -> None:
     add_json(made)
     made = add_verb(verbs, "show", show, "what is known about one sequence, and what its frames hold")
     add_sequence(made)
+    add_profile(made)
     add_settings(made, "ingest")
     made.add_argument(
         "--picture",
@@ -56,6 +57,7 @@ def add_arguments(parser: Parser) -> None:
         metavar="PATH|SEQUENCE",
         help="paths of folders, videos or DICOM files, or names in the catalogue",
     )
+    add_profile(made)
     add_settings(made, "ingest")
     add_json(made)
 
@@ -219,10 +221,9 @@ def _known(name: str) -> Descriptor | None:
 
 
 def _ingest(given: argparse.Namespace) -> IngestConfig:
-    from extrags.config import DEFAULT_PROFILE
     from flows.settings import pipeline_config
 
-    return pipeline_config(DEFAULT_PROFILE, given.settings).ingest
+    return pipeline_config(given.profile, given.settings).ingest
 
 
 def _write_picture(sequence: EndoscopicSequence, target: Path) -> None:

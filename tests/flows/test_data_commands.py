@@ -113,6 +113,14 @@ class TestShow:
         assert undocumented(shown, "data-show") == []
         assert shown["paths"] == [scene]
 
+    def test_at_the_size_of_a_profile(self, shared_data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        """As a run of that profile reads it."""
+        widths = []
+        for profile in ("quick", "balanced"):
+            assert main(["data", "show", "simcol3d/s1", "--profile", profile, "--json", "-"]) == 0
+            widths.append(json.loads(capsys.readouterr().out)["measured"]["width"])
+        assert widths[0] == widths[1] // 2
+
     def test_a_folder_as_a_table(self, scene: str, capsys: pytest.CaptureFixture[str]) -> None:
         assert main(["data", "show", scene]) == 0
         said = capsys.readouterr().out

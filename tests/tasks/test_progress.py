@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from extrags.events import Progress, emit
+from extrags.events import MetricRecorded, Progress, emit
 from tasks.progress import (
     LOG_EVERY_SECONDS,
     Pace,
@@ -140,6 +140,20 @@ class TestLog:
             with reporting("a sequence of this test alone", "enhance-keyframes"):
                 emit(Progress("enhance-keyframes", 1, 4))
         assert caplog.messages == []
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "told"),
+    [
+        ("judged_gain_over_classical_db", 0.10524, "judged gain over classical 0.1052 dB"),
+        ("domain_score", 2.0, "domain score 2"),
+    ],
+)
+def test_a_figure_is_told_in_words(name: str, value: float, told: str) -> None:
+    seen: list[StageProgress] = []
+    with observed(seen.append), reporting("scene", "enhance"):
+        emit(MetricRecorded("enhance", name, value))
+    assert [progress.detail for progress in seen] == [told]
 
 
 def test_events_of_a_stage_reach_the_observer() -> None:
