@@ -149,6 +149,10 @@ def detail_flags(config: PipelineConfig, counts: Mapping[str, Any]) -> str:
         counts: of the artefact of `ingest`.
     """
     given = config.ingest
+    if given.width is None and not counts["has_poses"]:
+        # Such frames may have been cut to the picture, where a width is that of whole frames. None of these
+        # sources has thumbnails.
+        return "--ingest.size detail" + (" --ingest.downscale none" if given.downscale is not None else "")
     if given.size != "thumbnail" and given.width is None and given.downscale is None:
         return "--ingest.size detail"
     height = "" if given.height is None else f" --ingest.height {counts['detail_height']}"

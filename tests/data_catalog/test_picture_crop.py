@@ -6,11 +6,13 @@ import logging
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
 
 from data_catalog import read
+from data_catalog.catalog import measured_detail
 from data_catalog.picture_crop import cropped_to_picture
 from extrags.cameras import pixel_rays
 from extrags.config import IngestConfig
@@ -96,6 +98,20 @@ def test_a_round_picture_of_a_video(tmp_path: Path) -> None:
     # A guess follows the round picture in either.
     np.testing.assert_allclose(found.K[0, :2, 2], [found.width / 2, found.height / 2], atol=1.5)
     assert found.K[0, 0, 0] == whole.K[0, 0, 0]
+
+
+def test_frames_of_the_size_of_their_detail_are_cut_too(tmp_path: Path) -> None:
+    """By a stage, which measures that size before, as by one call."""
+    scene = in_a_circle(moving_scene(30, *SIZE, speed=3), rim(150, 90, 84))
+    for number, image in enumerate(scene[:12]):
+        blurred = cv2.GaussianBlur(cv2.resize(image, None, fx=2, fy=2), (0, 0), 4)
+        Image.fromarray(blurred).save(tmp_path / f"{number:04d}.png")
+    config = IngestConfig(size="detail", detail_psnr_db=40)
+    detail = measured_detail(tmp_path, config)
+    assert detail is not None
+    assert detail.divisor > 1
+    once, twice = read(tmp_path, config), read(tmp_path, detail.applied_to(config))
+    assert once.width == twice.width < 0.6 * detail.reduced_width
 
 
 def test_a_round_picture_of_plain_frames(tmp_path: Path) -> None:

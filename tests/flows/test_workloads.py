@@ -150,7 +150,23 @@ def test_only_procedural_scenes_are_drawn() -> None:
 def test_what_asks_for_frames_of_that_size(settings: dict[str, Any], flags: str) -> None:
     """`size=detail` measures the source, and gives way to a width."""
     config = PipelineConfig(ingest=IngestConfig(**settings))
-    assert detail_flags(config, {"detail_width": 180, "detail_height": 144}) == flags
+    counts = {"detail_width": 180, "detail_height": 144, "has_poses": 1}
+    assert detail_flags(config, counts) == flags
+
+
+@pytest.mark.parametrize(
+    ("settings", "flags"),
+    [
+        ({"size": "thumbnail"}, "--ingest.size detail"),
+        ({"size": "thumbnail", "downscale": 2}, "--ingest.size detail --ingest.downscale none"),
+        ({"width": 225}, "--ingest.width 180"),
+    ],
+)
+def test_frames_that_may_have_been_cut_are_measured_again(settings: dict[str, Any], flags: str) -> None:
+    """The width of the picture is not that of whole frames, which a width would be taken for."""
+    config = PipelineConfig(ingest=IngestConfig(**settings))
+    counts = {"detail_width": 180, "detail_height": 144, "has_poses": 0}
+    assert detail_flags(config, counts) == flags
 
 
 @pytest.mark.parametrize(
