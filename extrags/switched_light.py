@@ -323,7 +323,8 @@ def _mixing(first: Float[np.ndarray, "m 3"], second: Float[np.ndarray, "m 3"]) -
         squares = np.einsum("m,mi,mj->ij", weights, first, first) + weights.sum() * NOISE**2 * np.eye(3)
         mixing = np.linalg.solve(squares, np.einsum("m,mi,mj->ij", weights, first, second))
         residual = np.linalg.norm(_mapped(first, mixing) - second, axis=1) / brightness
-        weight = np.minimum(1, np.median(residual) / np.maximum(residual, 1e-9)) ** 0.5
+        residual = np.maximum(residual, 1e-9)
+        weight = np.minimum(1, np.median(residual) / residual) ** 0.5
     return np.asarray(mixing)
 
 

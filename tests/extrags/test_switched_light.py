@@ -12,7 +12,7 @@ from extrags.config import IngestConfig
 from extrags.reading_corrections import with_corrections
 from extrags.sequence import EndoscopicSequence
 from extrags.splits import Split
-from extrags.switched_light import light_switch, with_matched_light
+from extrags.switched_light import _mixing, light_switch, with_matched_light
 from tests.benchmarks.wrong_recordings import WRONG
 from tests.extrags.depth.withheld import recorded
 
@@ -128,6 +128,11 @@ def test_large_frames_are_matched_at_a_smaller_size(switched: EndoscopicSequence
     found = light_switch(large)
     assert found is not None
     assert found.frames.tolist() == RARE
+
+
+def test_colours_that_are_mixed_exactly_have_a_map() -> None:
+    colors = np.random.default_rng(0).uniform(0.2, 0.8, (100, 3))
+    np.testing.assert_allclose(_mixing(colors, colors), np.eye(3), atol=0.01)
 
 
 def test_two_frames_are_too_few(switched: EndoscopicSequence) -> None:
