@@ -221,6 +221,8 @@ def _light(sequence: EndoscopicSequence) -> Iterator[Finding]:
     frames = zip(sequence.rgb, sequence.mask, strict=True)
     means = np.array([image[mask].mean(0) if mask.any() else np.ones(3) for image, mask in frames])
     hue = np.log(np.maximum(means[:, [0, 2]], 1.0) / np.maximum(means[:, 1:2], 1.0))
+    # What is matched while a source is read are training frames: others stay as they are.
+    shown &= np.isin(np.arange(len(sequence)), sequence.train)
     steps = [(k, hue[k] - hue[j]) for j, k in _neighbours(sequence) if shown[j] and shown[k]]
     if len(steps) < 4:
         return

@@ -60,6 +60,10 @@ _LEAST_CHROMA = 64
 """Of 255: what a pixel of colour differs by between its channels at least."""
 _SAME_COLOR = 0.95
 """Cosine of the angle between colours, from which on one is a shade of the other."""
+_BRIGHT_LABEL = 96
+"""Of 255: the largest channel of a label that is not black."""
+_OTHER_SHARE = 0.01
+"""Of the pixels of labels: what other colours have at most where a mask has one."""
 _NAMED_COLORS = 4
 _LEAST_OPACITY = 128
 """Of 255: pixels below are more transparent than opaque."""
@@ -257,6 +261,9 @@ def read_mask(file: Path, *, frame: object = None) -> Bool[np.ndarray, "h w"]:
         values = np.asarray(image.convert("L"))
         opacity = np.asarray(image.convert("LA"))[..., 1] if image.has_transparency_data else None
         colors = np.asarray(image.convert("RGB")) if image.mode in _COLORED_MODES else None
+        if colors is not None and opacity is not None:
+            # What is transparent has colours that nobody sees.
+            colors = colors * (opacity > 0)[..., None]
     if colors is not None and not _is_lossy(file):
         _check_mask_colors(colors, file, frame)
     found = np.unique(values)
@@ -289,19 +296,27 @@ def _check_mask_colors(colors: UInt8[np.ndarray, "h w 3"], file: Path, frame: ob
     Raises:
         SourceError: several colours, or one beside white.
     """
-    if not (np.ptp(colors, axis=-1) >= _LEAST_CHROMA).any():
+    channels = [colors[..., k] for k in range(3)]
+    chroma = np.maximum.reduce(channels) - np.minimum.reduce(channels)
+    if not (chroma >= _LEAST_CHROMA).any():
         return
     # As one number each: rows would take ten times as long to sort.
-    packed = np.unique(colors.astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], np.uint32))
+    packed, counts = np.unique(
+        colors.astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], np.uint32), return_counts=True
+    )
     several = np.stack([packed >> 16, packed >> 8 & 255, packed & 255], axis=1)
-    bright = several[several.max(1) >= _LEAST_CHROMA].astype(np.float64)
-    # What is left of a shade is rounded: the brightest of all tells the colour.
-    color = bright[np.argmax(bright.sum(1))]
-    likeness = bright @ color / (np.linalg.norm(bright, axis=1) * np.linalg.norm(color))
-    if (likeness < _SAME_COLOR).any():
+    bright = several.max(1) >= _BRIGHT_LABEL
+    if not bright.any():
+        return
+    labels, counts = several[bright].astype(np.float64), counts[bright]
+    color = labels[np.argmax(counts)]
+    likeness = labels @ color / (np.linalg.norm(labels, axis=1) * np.linalg.norm(color))
+    # What compression leaves at edges is little.
+    if counts[likeness < _SAME_COLOR].sum() > _OTHER_SHARE * counts.sum():
+        order = np.argsort(-counts, kind="stable")[:_NAMED_COLORS]
         raise SourceError(
-            f"labels in {len(several)} colours (the first in red, green and blue: "
-            f"{', '.join(str(tuple(map(int, color))) for color in several[:_NAMED_COLORS])}); "
+            f"labels in several colours (most pixels have, in red, green and blue: "
+            f"{', '.join(str(tuple(map(int, labels[place]))) for place in order)}); "
             "expected white where tissue is, and black, or two labels of which one is black",
             file=file,
             frame=frame,

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Iterable, Iterator
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, UInt8
 
 from data_catalog.findings import Finding, warning
 from extrags.sequence import EndoscopicSequence
@@ -32,7 +32,7 @@ def mask_findings(sequence: EndoscopicSequence) -> Iterator[Finding]:
     kept = np.array([float(mask.mean()) for mask in sequence.mask])
     if 1 - kept.mean() < 0.02:
         return
-    lit_inside, lit_outside = _shares(sequence, (image.max(axis=-1) > 25 for image in sequence.rgb))
+    lit_inside, lit_outside = _shares(sequence, (_brightest(image) > 25 for image in sequence.rgb))
     if lit_inside < 0.3 and lit_outside > 0.6:
         yield Finding(
             kind="error",
@@ -81,6 +81,11 @@ def tell_of_inverted_masks(sequence: EndoscopicSequence) -> None:
         if finding.topic == _POLARITY:
             told = {"topic": finding.topic, "field": finding.field, "kind": finding.kind}
             _log.warning("%s: %s", sequence.name, finding.sentence, extra=told)
+
+
+def _brightest(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w"]:
+    """Largest channel of each pixel; several times as fast as over the last axis."""
+    return np.asarray(np.maximum(np.maximum(image[..., 0], image[..., 1]), image[..., 2]))
 
 
 def _shares(sequence: EndoscopicSequence, frames: Iterable[Bool[np.ndarray, "h w"]]) -> tuple[float, float]:

@@ -32,7 +32,7 @@ def cropped_to_picture(sequence: EndoscopicSequence, config: IngestConfig) -> En
     A round picture in a wide frame is a third to a half of it. What lies round it costs time and memory in
     every stage, and networks that look at a frame at a fixed size would see less of the tissue. Frames of a
     source with poses stay as they are: others render these at the size that their source has. So do frames
-    of a width that the settings name.
+    of a width that the settings name, and those whose principal point lies outside the box.
 
     Args:
         sequence: as its reader has it.
@@ -51,6 +51,10 @@ def cropped_to_picture(sequence: EndoscopicSequence, config: IngestConfig) -> En
     top, bottom, left, right = rows[0], rows[-1] + 1, columns[0], columns[-1] + 1
     height, width = int(bottom - top), int(right - left)
     if height * width > MOST_KEPT_SHARE * shown.size or min(height, width) < LEAST_SIDE_PX:
+        return sequence
+    centers = sequence.K[:, :2, 2]
+    if (centers <= [left, top]).any() or (centers >= [right, bottom]).any():
+        # No camera has its axis beside its image, by what COLMAP and most other programs ask.
         return sequence
 
     def cut(stack: Shaped[np.ndarray, "f h w *c"]) -> Shaped[np.ndarray, "f h2 w2 *c"]:

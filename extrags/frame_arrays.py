@@ -63,7 +63,9 @@ def sequence_from_arrays(
             names frame and field.
 
     Returns:
-        The sequence; arrays that need no conversion are not copied.
+        The sequence; arrays that need no conversion are not copied. What is corrected of every source is
+        corrected here too, each with a warning (`extrags.reading_corrections`): colours of frames of another
+        light, and masks and depth of instruments, among them.
     """
     if not isinstance(name, str):
         raise ConfigError(f"name is {name!r}, expected a text")

@@ -155,8 +155,10 @@ def light_switch(sequence: EndoscopicSequence) -> LightSwitch | None:
     if len(sequence.train) < 2 * LEAST_FRAMES:
         return None
     train = np.sort(sequence.train)
-    colors = {int(frame): _log_color(sequence, int(frame)) for frame in train}
-    groups = _two_lights(np.stack([colors[int(frame)] for frame in train]))
+    colors = np.stack([_log_color(sequence, int(frame)) for frame in train])
+    tells = np.isfinite(colors).all(1)
+    train, colors = train[tells], colors[tells]
+    groups = _two_lights(colors) if len(train) >= 2 * LEAST_FRAMES else None
     if groups is None:
         return None
     rare, centers = groups
@@ -188,13 +190,13 @@ def light_switch(sequence: EndoscopicSequence) -> LightSwitch | None:
 
 
 def _log_color(sequence: EndoscopicSequence, frame: int) -> Float[np.ndarray, "2"]:
-    """Logarithms of red and blue over green, of a frame's mean in linear light; 0 where nothing tells."""
+    """Logarithms of red and blue over green, of a frame's mean in linear light; NaN where nothing tells."""
     every = max(1, round(np.sqrt(sequence.height * sequence.width / LOOKED_AT_PX)))
     pixels = sequence.rgb[frame][::every, ::every][sequence.mask[frame][::every, ::every]]
     brightest = pixels.max(1, initial=0)
     pixels = pixels[(brightest >= DARKEST) & (brightest <= BRIGHTEST)]
     if not len(pixels):
-        return np.zeros(2)
+        return np.full(2, np.nan)
     return np.asarray(_log_ratios(((pixels / 255.0) ** GAMMA).mean(0, keepdims=True) ** (1 / GAMMA))[0])
 
 
@@ -209,10 +211,13 @@ def _two_lights(
 ) -> tuple[Bool[np.ndarray, "n"], Float[np.ndarray, "2 2"]] | None:
     """Which frames are of the rarer light, and the mean colours of it and of the other.
 
-    None where frames do not fall into two groups that are far apart.
+    Of as many frames of both the less red light, as narrow bands are, is taken for the rarer one. None where
+    frames do not fall into two groups that are far apart.
     """
     centered = colors - colors.mean(0)
     axis = np.linalg.svd(centered, full_matrices=False)[2][0]
+    # Its sign is arbitrary: the redder frames are to come last.
+    axis = axis if axis[0] >= 0 else -axis
     place = centered @ axis
     order = np.argsort(place, kind="stable")
     ordered = place[order]
@@ -229,7 +234,7 @@ def _two_lights(
 
 
 def _is_nearer(color: Float[np.ndarray, "2"], centers: Float[np.ndarray, "2 2"]) -> bool:
-    """Whether a colour is nearer to the first centre."""
+    """Whether a colour is nearer to the first centre; one that is not known is not."""
     there, other = np.linalg.norm(centers - color, axis=1)
     return bool(there < other)
 

@@ -254,7 +254,7 @@ class TestMasks:
         image.putpalette([255, 114, 114, 170, 255, 0])
         (image if palette else image.convert("RGB")).save(tmp_path / "a.png")
         with pytest.raises(
-            SourceError, match=r"a\.png, frame 7, field mask: labels in 2 colours .*\(170, 255, 0\), \(255"
+            SourceError, match=r"a\.png, frame 7, field mask: labels in several colours .*\(170, 255, 0\)"
         ):
             read_mask(tmp_path / "a.png", frame=7)
 
@@ -267,6 +267,21 @@ class TestMasks:
             # Shades between the two are no third label.
             labelled.resize((60, 40), Image.Resampling.BILINEAR).save(tmp_path / "b.png")
             assert 0.1 < read_mask(tmp_path / "b.png").mean() < 0.9
+
+    @pytest.mark.parametrize("color", [(0, 255, 0), (255, 165, 0)])
+    def test_one_colour_that_was_compressed(self, tmp_path: Path, color: tuple[int, int, int]) -> None:
+        """Chroma of half the size bleeds over the edges."""
+        large = np.kron(self.LABELS, np.ones((8, 8), np.uint8))
+        Image.fromarray(large[..., None] * np.array(color, np.uint8)).save(tmp_path / "a.jpg", quality=90)
+        Image.open(tmp_path / "a.jpg").save(tmp_path / "a.png")
+        assert (read_mask(tmp_path / "a.png") == (large > 0)).mean() > 0.98
+
+    def test_colours_of_what_is_transparent_are_no_labels(self, tmp_path: Path) -> None:
+        image = np.zeros((20, 30, 4), np.uint8)
+        image[..., 0] = 255
+        image[self.LABELS > 0] = 255
+        Image.fromarray(image).save(tmp_path / "a.png")
+        read_mask(tmp_path / "a.png")
 
     def test_opacity_is_no_mask(self, tmp_path: Path) -> None:
         image = np.full((20, 30, 4), 255, np.uint8)

@@ -72,6 +72,10 @@ def test_what_stays_as_it_is(framed: EndoscopicSequence) -> None:
     assert cropped_to_picture(posed, IngestConfig()) is posed
     narrow = replace(framed, mask=framed.mask & (np.arange(320) < 150))
     assert cropped_to_picture(narrow, IngestConfig()) is narrow
+    K = framed.K.copy()
+    K[3, 0, 2] = 205
+    beside = replace(framed, K=K)
+    assert cropped_to_picture(beside, IngestConfig()) is beside
     nothing = replace(framed, mask=np.zeros_like(framed.mask))
     assert cropped_to_picture(nothing, IngestConfig()) is nothing
 

@@ -77,6 +77,25 @@ def test_more_frames_decide_what_light_the_others_get(switched: EndoscopicSequen
     assert difference(matched, kept, 3) > 5
 
 
+@pytest.mark.parametrize("first", [0, 4])
+def test_of_as_many_of_both_white_light_stays(switched: EndoscopicSequence, first: int) -> None:
+    kept = replace(switched, split=Split("half", np.arange(first, first + 8), np.array([12])))
+    found = light_switch(kept)
+    assert found is not None
+    assert found.frames.tolist() == RARE
+
+
+def test_frames_that_show_no_colour_are_of_no_light(switched: EndoscopicSequence) -> None:
+    rgb = np.array(switched.rgb)
+    rgb[9] = 3
+    rgb[0] = np.where(rgb[0] > 100, 255, 0)
+    mask = np.array(switched.mask)
+    mask[12] = False
+    found = light_switch(replace(switched, rgb=rgb, mask=mask))
+    assert found is not None
+    assert found.frames.tolist() == RARE
+
+
 def test_held_out_frames_of_the_rarer_light_are_left_out(switched: EndoscopicSequence) -> None:
     train = np.setdiff1d(np.arange(12), [5])
     kept = replace(switched, split=Split("held out", train, np.array([5, 12])))
