@@ -54,7 +54,7 @@ def sift_features(rgb: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]
     grey = cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2GRAY)
     # Mucosa is pale and unevenly lit: contrast is raised block by block.
     grey = cv2.createCLAHE(clipLimit=4.0, tileGridSize=(8, 8)).apply(grey)
-    finder = cv2.SIFT_create(nfeatures=FEATURES, contrastThreshold=CONTRAST, edgeThreshold=20)  # type: ignore[attr-defined]
+    finder = cv2.SIFT.create(nfeatures=FEATURES, contrastThreshold=CONTRAST, edgeThreshold=20)
     keypoints, descriptors = finder.detectAndCompute(grey, mask.astype(np.uint8) * 255)
     if descriptors is None or len(keypoints) == 0:
         return Features.none()
@@ -68,7 +68,15 @@ def sift_features(rgb: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]
 def mutual_matches(
     first: Float[np.ndarray, "n 128"], second: Float[np.ndarray, "m 128"]
 ) -> Int[np.ndarray, "k 2"]:
-    """Rows of descriptors that are each other's nearest and clearly nearer than the second nearest."""
+    """Rows of descriptors that are each other's nearest and clearly nearer than the second nearest.
+
+    Args:
+        first: of one frame, of unit length, [n, 128].
+        second: of the other, [m, 128].
+
+    Returns:
+        Row in the first and row in the second, [k, 2].
+    """
     if len(first) < 2 or len(second) < 2:
         return np.zeros((0, 2), dtype=np.int64)
     likeness = first @ second.T

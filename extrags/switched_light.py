@@ -89,7 +89,8 @@ class LightSwitch:
 
     Args:
         frames: indices in the sequence, held-out ones among them.
-        mixing: stored values of the other light are those of this one times this, [3, 3].
+        mixing: stored values (in any unit, a row each) of the other light are those of this one times this,
+            [3, 3].
         matches: of features that told.
         difference: of the colours at these before, relative, in the median.
         left: the same with the map.
