@@ -171,12 +171,15 @@ def glance(name_or_path: str | Path, config: IngestConfig | None = None) -> Glan
     return seen
 
 
-def read(source: Source | str | Path, config: IngestConfig | None = None) -> EndoscopicSequence:
+def read(
+    source: Source | str | Path, config: IngestConfig | None = None, *, detail: DetailSize | None = None
+) -> EndoscopicSequence:
     """Read a source into a checked `EndoscopicSequence` with its specular highlights marked.
 
     Args:
         source: what `resolve` returns, or takes.
         config: size, frames and split; None takes those of the profile `balanced`.
+        detail: what `measured_detail` has found with the same settings; None measures where they ask for it.
 
     Raises:
         SourceError: a file is wrong; names file, frame and field. `SourceNotFoundError` and `PoseError`
@@ -189,7 +192,7 @@ def read(source: Source | str | Path, config: IngestConfig | None = None) -> End
     dataset, config = _dataset(source), _settings(config, "read")
     _check_own(dataset, source, config)
     _check_time_span(source, config)
-    detail = source_detail(dataset, source, config)
+    detail = source_detail(dataset, source, config) if detail is None else detail
     sequence = dataset.read(source, config if detail is None else detail.applied_to(config))
     reader = find_reader(source.format)
     stored = OPENCV if reader is None else reader.poses

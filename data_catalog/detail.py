@@ -64,10 +64,8 @@ class DetailSize:
 
     def applied_to(self, config: IngestConfig) -> IngestConfig:
         """The settings that read frames of this size."""
-        if self.divisor == 1:
-            return config.model_copy(update={"size": "source"})
-        # A width decides where there is one; that it is none that somebody has set is still told.
-        return config.model_copy(update={"width": self.reduced_width})
+        width = None if self.divisor == 1 else self.reduced_width
+        return config.model_copy(update={"size": "source", "width": width})
 
     def __str__(self) -> str:
         if self.divisor == 1:

@@ -36,11 +36,9 @@ def cropped_to_picture(sequence: EndoscopicSequence, config: IngestConfig) -> En
 
     Args:
         sequence: as its reader has it.
-        config: `crop_surround`; `width` and `size`, since with `size=detail` frames are cut whatever width
-            their detail takes.
+        config: as it was given, `crop_surround` and `width`.
     """
-    width_is_set = config.width is not None and config.size != "detail"
-    if not config.crop_surround or width_is_set or sequence.world_from_camera is not None:
+    if not config.crop_surround or config.width is not None or sequence.world_from_camera is not None:
         return sequence
     shown = np.zeros((sequence.height, sequence.width), dtype=bool)
     for mask in sequence.mask:

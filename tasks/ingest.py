@@ -45,7 +45,7 @@ def ingest(
 
     config = config.model_copy(update={"calibration": calibration})
     asked = measured_detail(source, config)
-    sequence = read(source, config if asked is None else asked.applied_to(config))
+    sequence = read(source, config, detail=asked)
     # By content, as for the key. Where this process made the key, only files are read again that changed
     # since, or not long before; another process, as a cluster's worker, reads all of them: 1.3 s per GB.
     if digest_of(source_fingerprint(source, config)) != digest_of(fingerprint):

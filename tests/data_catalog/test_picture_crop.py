@@ -114,8 +114,10 @@ def test_frames_of_the_size_of_their_detail_are_cut_too(tmp_path: Path) -> None:
     detail = measured_detail(tmp_path, config)
     assert detail is not None
     assert detail.divisor > 1
-    once, twice = read(tmp_path, config), read(tmp_path, detail.applied_to(config))
+    once, twice = read(tmp_path, config), read(tmp_path, config, detail=detail)
     assert once.width == twice.width < 0.6 * detail.reduced_width
+    # Who sets a width gets it.
+    assert read(tmp_path, IngestConfig(size="detail", width=320)).width == 320
 
 
 def test_a_round_picture_of_plain_frames(tmp_path: Path) -> None:

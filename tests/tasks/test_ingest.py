@@ -7,6 +7,7 @@ import json
 import os
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -59,8 +60,8 @@ def test_files_that_change_while_they_are_read(
 
     read = data_catalog.read
 
-    def read_then_changed(*given: object) -> EndoscopicSequence:
-        found = read(*given)
+    def read_then_changed(*given: Any, **named: Any) -> EndoscopicSequence:
+        found = read(*given, **named)
         (folder / "rgb" / "2.png").write_bytes((folder / "rgb" / "1.png").read_bytes())
         return found
 
