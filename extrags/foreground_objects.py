@@ -15,8 +15,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from extrags.cameras import project_points, transform_points, unproject_pixels
+from extrags.blurred_depth_edges import ramps
 from extrags.carried_depth import CHECKED_FRAMES, CarriedDepth, evenly, relative_error
+from extrags.depth_votes import depth_votes
 from extrags.frame_stacks import stacked
 from extrags.observed_surface import observed_through_masks
 from extrags.sequence import EndoscopicSequence
@@ -181,36 +182,22 @@ def _is_suspect(votes: _Votes) -> bool:
 
 def _votes(carried: CarriedDepth, position: int, others: list[int], error: float, pixels: int) -> _Votes:
     """What frames say of about so many pixels of another one."""
-    cameras, poses = carried.cameras, carried.cameras.world_from_camera
+    cameras = carried.cameras
     every = max(1, round(np.sqrt(cameras.width * cameras.height / pixels)))
-    kept = slice(every // 2, None, every)
-    depth = carried.known(position)[kept, kept]
-    v, u = (axis[kept, kept] + 0.5 for axis in np.mgrid[: cameras.height, : cameras.width])
-    known = np.flatnonzero(depth.ravel() > 0)
-    z = depth.ravel()[known]
-    centers = np.stack([u.ravel()[known], v.ravel()[known]], axis=1)
-    points = unproject_pixels(centers, cameras.K[position], cameras.lens) * z[:, None]
-    looks_through, clearly, supports = np.zeros((3, depth.size), dtype=np.int64)
-    in_front = max(IN_FRONT, IN_FRONT_ERRORS * error)
-    far_in_front = max(CLEARLY, CLEARLY_ERRORS * error)
-    for other in others:
-        motion = np.linalg.inv(poses[other]) @ poses[position]
-        there = transform_points(motion, points)
-        place = project_points(there, cameras.K[other], cameras.lens) - 0.5
-        with np.errstate(invalid="ignore"):
-            inside = (place >= 0).all(1) & (place < (cameras.width - 1, cameras.height - 1)).all(1)
-        column, row = np.floor(place[inside]).astype(np.int64).T
-        surface = carried.known(other)
-        corners = np.stack([surface[row + j, column + i] for j in (0, 1) for i in (0, 1)])
-        measured = (corners > 0).all(0)
-        which, reached = known[inside][measured], there[inside, 2][measured]
-        # Between the nearest and the farthest of the pixels round a point may be an edge.
-        nearest, farthest = (np.log(end[measured] / reached) for end in (corners.min(0), corners.max(0)))
-        looks_through[which] += nearest > in_front
-        clearly[which] += nearest > far_in_front
-        supports[which] += (nearest <= in_front) & (farthest >= -in_front)
-    shape = depth.shape
-    return _Votes(depth, looks_through.reshape(shape), clearly.reshape(shape), supports.reshape(shape))
+    grid = carried.known(position)
+    depth = np.where(ramps(grid), 0, grid)[every // 2 :: every, every // 2 :: every]
+    rows, columns = np.nonzero(depth > 0)
+    found = depth_votes(
+        carried,
+        position,
+        others,
+        (every // 2 + every * rows, every // 2 + every * columns),
+        max(IN_FRONT, IN_FRONT_ERRORS * error),
+        max(CLEARLY, CLEARLY_ERRORS * error),
+    )
+    maps = np.zeros((len(found), *depth.shape), np.int64)
+    maps[:, rows, columns] = found
+    return _Votes(depth, *maps)
 
 
 def _objects(votes: _Votes) -> Bool[np.ndarray, "h w"]:

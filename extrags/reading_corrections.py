@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from extrags.blurred_depth_edges import without_blurred_depth_edges
 from extrags.carried_depth import CarriedDepth
 from extrags.config import IngestConfig
 from extrags.depth_noise import with_clean_depth
@@ -22,8 +23,9 @@ def with_corrections(sequence: EndoscopicSequence, config: IngestConfig | None =
     In this order, each with a warning where it changes anything: frames that show nothing are left out;
     frames of another light get the colours of the others; depth of few frames is left to the evaluation;
     speckles and noise of depth are taken out; what all frames have in common and is off is corrected; frames
-    whose poses are grossly wrong are left out; objects in front of the surface are masked; and depth that
-    frames disagree about is given an expected error. Of a sequence without poses the first two alone.
+    whose poses are grossly wrong are left out; objects in front of the surface are masked; depth between
+    surfaces whose edges are blurred is taken to be unknown; and depth that frames disagree about is given an
+    expected error. Of a sequence without poses the first two alone.
 
     Args:
         sequence: as its source has it.
@@ -49,5 +51,9 @@ def with_corrections(sequence: EndoscopicSequence, config: IngestConfig | None =
     if config.mask_foreground:
         given = sequence
         sequence = without_foreground_objects(given, carried)
+        carried = carried if sequence is given else CarriedDepth.of(sequence)
+    if config.depth_error == "auto":
+        given = sequence
+        sequence = without_blurred_depth_edges(given, carried)
         carried = carried if sequence is given else CarriedDepth.of(sequence)
     return with_depth_error(sequence, carried, config.depth_error)

@@ -17,7 +17,7 @@ log = logging.getLogger(__name__)
 
 
 # The fingerprint covers the content of the files; their location is not part of the key.
-@stage("ingest", version=11, ignore=("source", "calibration"))
+@stage("ingest", version=12, ignore=("source", "calibration"))
 def ingest(
     slot: Slot,
     source: Source,

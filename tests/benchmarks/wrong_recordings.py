@@ -55,6 +55,18 @@ def _speckled(frame: int, depth: np.ndarray) -> np.ndarray:
     return np.where(generator.random(depth.shape) < 0.1, anything, depth)
 
 
+def _blurred(frame: int, depth: np.ndarray) -> np.ndarray:
+    """Its edges are blurred, by 1 px of a picture of 160 px."""
+    return np.asarray(cv2.GaussianBlur(depth, (0, 0), depth.shape[1] / 160))
+
+
+def _enlarged(frame: int, depth: np.ndarray) -> np.ndarray:
+    """As of a picture of a quarter of the size that was enlarged with interpolation."""
+    size = depth.shape[::-1]
+    small = cv2.resize(depth, (size[0] // 4, size[1] // 4), interpolation=cv2.INTER_NEAREST)
+    return np.asarray(cv2.resize(small, size, interpolation=cv2.INTER_LINEAR))
+
+
 def _along_ray(sequence: Sequence) -> Sequence:
     lengths = np.linalg.norm(pixel_rays(sequence.cameras), axis=-1)
     return _depths(sequence, lambda frame, depth: depth * lengths[frame])
@@ -176,6 +188,8 @@ WRONG: dict[str, Callable[[Sequence], Sequence]] = {
     "monocular": lambda sequence: _depths(sequence, _monocular),
     "noise": lambda sequence: _depths(sequence, _noisy),
     "speckles": lambda sequence: _depths(sequence, _speckled),
+    "blurred edges": lambda sequence: _depths(sequence, _blurred),
+    "enlarged": lambda sequence: _depths(sequence, _enlarged),
     "unit": lambda sequence: _depths(sequence, lambda _, depth: 1.1 * depth),
     "offset": lambda sequence: _depths(sequence, lambda _, depth: depth + 2),
     "ray": _along_ray,
