@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from extrags.metrics.image import psnr_per_image, ssim_map
+from extrags.metrics.image import SSIM_WINDOW_PX, psnr_per_image, ssim_map
 from extrags.restoration.clips import as_images, as_planes, keep_known
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.diffusion.rectified_flow import Sampled
@@ -76,9 +76,10 @@ def validation_scores(
         candidates: numbers of sampling steps.
 
     Returns:
-        Of `none` (the rendering), `classical` (blend and fill) and `embedded_N`: `{psnr, psnr_kept, ssim}`,
-        `psnr_kept` with the rendering put back where it is certain, as for the fine-tuning; and `psnr_hole`
-        where a validation pair has pixels of alpha below one half.
+        Of `none` (the rendering), `classical` (blend and fill) and `embedded_N`: `{psnr, psnr_kept}`,
+        `psnr_kept` with the rendering put back where it is certain, as for the fine-tuning; `ssim` where the
+        pairs are large enough for its window; and `psnr_hole` where a validation pair has pixels of alpha
+        below one half.
     """
     chosen = validation_pairs(pairs) or pairs
     return scores_of([restored_pairs(enhancer, chosen, transfer, steps) for steps in candidates], transfer)
@@ -128,8 +129,10 @@ def _score(image: Float[Tensor, "n 3 h w"], pairs: Pairs) -> dict[str, float]:
     score = {
         "psnr": _mean_psnr(render, target, mask),
         "psnr_kept": _mean_psnr(_with_known(render, pairs), target, mask),
-        "ssim": float(ssim_map(render, target, figures=False)[mask].mean()),
     }
+    # Frames of a narrow band are large enough for it, and not any more at the width they are restored at.
+    if min(pairs.size) > SSIM_WINDOW_PX // 2:
+        score["ssim"] = float(ssim_map(render, target, figures=False)[mask].mean())
     if bool(hole.any()):
         error = (render - target)[hole].square().mean()
         score["psnr_hole"] = float(-10 * error.clamp_min(1e-10).log10())

@@ -15,6 +15,7 @@ from extrags.config import CoarseConfig
 from extrags.depth.hidden import SOLID
 from extrags.errors import ConfigError, WeightsError
 from extrags.events import Event, subscribed
+from extrags.metrics.image import SSIM_WINDOW_PX
 from extrags.restoration.backends import load_enhancer, train_enhancer
 from extrags.restoration.classical import ClassicalEnhancer
 from extrags.restoration.diffusion import scene_restorer
@@ -23,7 +24,7 @@ from extrags.restoration.diffusion.error_fit import cell_errors, error_over_expe
 from extrags.restoration.diffusion.frame_features import sequence_features
 from extrags.restoration.diffusion.scene_restorer import best_of_all, familiar
 from extrags.restoration.diffusion.scene_training import train_on_scene
-from extrags.restoration.diffusion.validation import restored_pairs, validation_pairs
+from extrags.restoration.diffusion.validation import restored_pairs, validation_pairs, validation_scores
 from extrags.restoration.protocol import Clip, Enhancer, never_trained_on
 from extrags.restoration.training_data.pairs import Pairs
 from extrags.restoration.uncertainty import calibration
@@ -31,6 +32,7 @@ from extrags.restoration.uncertainty.calibration import Calibration
 from extrags.restoration.uncertainty.domain import Domain
 from extrags.thresholds import HOLE_ALPHA
 from extrags.training.leave_out import leave_out_folds
+from extrags.view_synthesis.conditioning import Layers
 from extrags.view_synthesis.gamut import Gamut
 from tests.extrags.lit_tube import Tube
 from tests.extrags.restoration.conftest import SMALL
@@ -414,6 +416,24 @@ class TestEmbedded:
         assert found is not None
         assert before is not None
         assert len(found) == len(before) - 1
+
+    @pytest.mark.parametrize("height", [4, 6])
+    def test_pairs_lower_than_the_window_of_ssim_are_judged_without_it(
+        self, tube: Tube, tube_pairs: Pairs, trained: EmbeddedEnhancer, height: int
+    ) -> None:
+        """Frames of 640 x 8 px are restored at 320 x 4."""
+        low = replace(
+            tube_pairs,
+            layers=Layers(tube_pairs.layers.data[:, :, :height]),
+            target=tube_pairs.target[:, :, :height],
+            weight=tube_pairs.weight[:, :, :height],
+            depth_mm=tube_pairs.depth_mm[:, :, :height],
+        )
+        scores = validation_scores(trained, low, tube.references.transfer, (1,))
+        assert set(scores) == {"none", "classical", "embedded_1"}
+        for score in scores.values():
+            assert {"psnr", "psnr_kept"} <= set(score)
+            assert ("ssim" in score) == (height > SSIM_WINDOW_PX // 2)
 
     def test_error_over_what_was_expected(
         self, tube: Tube, tube_pairs: Pairs, trained: EmbeddedEnhancer
