@@ -156,7 +156,7 @@ def _check_fits(
     earlier: EarlierScene, sequence: EndoscopicSequence, chosen: Int[np.ndarray, "m"], config: CoarseConfig
 ) -> None:
     name, scene = sequence.name, earlier.scene
-    if not np.isin(earlier.frames, chosen).all() or (np.diff(chosen) <= 0).any():
+    if not np.isin(earlier.frames, chosen).all() or (chosen[1:] <= chosen[:-1]).any():
         raise ShapeError(
             f"{name}: the earlier scene was trained on {len(earlier.frames)} frames; expected that all of "
             f"them are among the {len(chosen)} training frames, which are in ascending order"

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import inspect
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,7 @@ from extrags.errors import ConfigError, ShapeError
 from extrags.events import Event, Progress, subscribed
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
-from extrags.training import EarlierScene, TrainingResult, reconstruct
+from extrags.training import EarlierScene, TrainingResult, continuing, reconstruct
 from extrags.training.continuing import (
     continued_iterations,
     continued_start,
@@ -237,6 +238,20 @@ class TestStart:
             reconstruct(tube_sequence, CONFIG, earlier=EarlierScene(first, held_out, 10))
         with pytest.raises(ShapeError, match="exposures, expected one for each"):
             reconstruct(tube_sequence, CONFIG, earlier=EarlierScene(first, old_frames[:-1], 10))
+
+    @pytest.mark.parametrize("dtype", [np.int64, np.uint8, np.uint64])
+    def test_frames_out_of_order_are_refused(
+        self, tube_sequence: EndoscopicSequence, old_frames: np.ndarray, first: Scene, dtype: type
+    ) -> None:
+        """Without a sign, the difference of two indices is never below zero."""
+        # Callers' arrays are checked in tests alone, and those without a sign are none that should come.
+        check = inspect.unwrap(continuing._check_fits)
+        earlier = EarlierScene(first, old_frames, 10)
+        in_order = tube_sequence.train.astype(dtype)
+        check(earlier, tube_sequence, in_order, CONFIG)
+        for frames in (in_order[::-1], np.concatenate([in_order, in_order[-1:]])):
+            with pytest.raises(ShapeError, match="in ascending order"):
+                check(earlier, tube_sequence, frames, CONFIG)
 
 
 @pytest.mark.parametrize(
