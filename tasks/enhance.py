@@ -119,7 +119,7 @@ def _only(config: EnhanceConfig, names: frozenset[str]) -> EnhanceConfig:
 
 
 # The model's digest is in the key: with another model in the same place, this is another restorer.
-@stage("enhance-train", version=32, ignore=("given",))
+@stage("enhance-train", version=33, ignore=("given",))
 def train(
     slot: Slot,
     scene: Ref,
@@ -165,7 +165,7 @@ def train(
     train_enhancer(shown, frames, config, coarse).save(slot.path / RESTORER)
 
 
-@stage("enhance-keyframes", version=13)
+@stage("enhance-keyframes", version=14)
 def keyframes(
     slot: Slot, scene: Ref, sequence: Ref, explore: Ref, restorer: Ref, config: EnhanceConfig
 ) -> None:
@@ -191,7 +191,7 @@ def keyframes(
 
 
 # The weights' digest is in the key; where their file lies is not.
-@stage("enhance-restore", version=17, ignore=("weights",))
+@stage("enhance-restore", version=18, ignore=("weights",))
 def restore(
     slot: Slot,
     scene: Ref,

@@ -66,7 +66,7 @@ def restoring_settings(config: EnhanceConfig, finish: Finish) -> EnhanceConfig:
     return settings.model_copy(update={"precision": chosen_precision(config)})
 
 
-@stage("evaluate-restore", version=17)
+@stage("evaluate-restore", version=18)
 def restore(
     slot: Slot,
     renders: Ref,

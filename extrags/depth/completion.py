@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from extrags.depth.frames import PosedFrames
+from extrags.depth.halving import HalvingConv2d
 from extrags.depth.stereo import NEARLY_SATURATED, SURE_AGREEMENT, StereoDepth
 
 __all__ = [
@@ -134,7 +135,7 @@ class CompletionNetwork(nn.Module):
         self.entrance = nn.Conv2d(INPUT_CHANNELS, widths[0], 3, padding=1)
         self.down = nn.ModuleList(_Block(width, width) for width in widths)
         self.coarser = nn.ModuleList(
-            nn.Conv2d(fine, coarse, 3, stride=2, padding=1) for fine, coarse in itertools.pairwise(widths)
+            HalvingConv2d(fine, coarse) for fine, coarse in itertools.pairwise(widths)
         )
         self.finer = nn.ModuleList(nn.Conv2d(coarse, fine, 1) for fine, coarse in itertools.pairwise(widths))
         self.up = nn.ModuleList(_Block(2 * width, width) for width in widths[:-1])

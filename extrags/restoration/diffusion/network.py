@@ -22,6 +22,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
+from extrags.depth.halving import HalvingConv2d
 from extrags.restoration.diffusion.texture_transfer import PatchFeatures, TextureTransfer
 from extrags.view_synthesis.conditioning import CONDITION_CHANNELS
 
@@ -104,9 +105,9 @@ class RestorationNetwork(nn.Module):
         )
         self.entrance = nn.Conv2d((condition_channels + 3) * blocks, fine, 3, padding=1)
         self.down_fine = ResidualBlock(fine, fine)
-        self.to_middle = nn.Conv2d(fine, middle, 3, stride=2, padding=1)
+        self.to_middle = HalvingConv2d(fine, middle)
         self.down_middle = ResidualBlock(middle, middle)
-        self.to_coarse = nn.Conv2d(middle, coarse, 3, stride=2, padding=1)
+        self.to_coarse = HalvingConv2d(middle, coarse)
         self.down_coarse = ResidualBlock(coarse, coarse)
         self.attention = SelfAttention(coarse)
         self.up_coarse = ResidualBlock(coarse, coarse)

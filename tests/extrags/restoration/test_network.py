@@ -37,6 +37,21 @@ class TestNetwork:
         torch.testing.assert_close(restored.rgb, conditioning.base, atol=1e-5, rtol=0)
         torch.testing.assert_close(restored.depth_mm, conditioning.depth_mm, atol=0, rtol=1e-5)
 
+    def test_narrow_views_are_restored_in_half_precision(self) -> None:
+        """Eight pixels are one where the network is coarsest."""
+        network = build_network(CONDITION_CHANNELS, (48, 96, 160), torch.Generator().manual_seed(1))
+        generator = torch.Generator().manual_seed(4)
+        with torch.no_grad():
+            for parameter in network.parameters():
+                parameter.add_(0.02 * torch.randn(parameter.shape, generator=generator))
+        noise = torch.randn(1, 3, 320, 7, generator=generator)
+        exact, half = (
+            sample(network, _conditioning(1, 320, 7), noise, steps=1, half_precision=half_precision)
+            for half_precision in (False, True)
+        )
+        assert float((half.rgb - exact.rgb).abs().max()) < 0.05
+        assert float((half.depth_mm / exact.depth_mm).log().abs().max()) < 0.05
+
     @pytest.mark.parametrize(("height", "width"), [(32, 32), (33, 47)])
     def test_any_size(self, height: int, width: int) -> None:
         network = build_network(CONDITION_CHANNELS, WIDTHS, torch.Generator().manual_seed(1))
