@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from extrags.config import EnhanceConfig
+from extrags.errors import CaptureError
 from extrags.events import MetricRecorded, emit
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.diffusion.error_fit import with_calibration
@@ -49,9 +50,10 @@ def train_on_scene(
 ) -> EmbeddedEnhancer:
     """Train on a scene's pairs, and keep the training only where the validation pairs show a gain.
 
-    With `start`, its network is fine-tuned; without a gain on the validation pairs, its weights are kept
-    unchanged. With one, what it was before is kept beside it (`EmbeddedEnhancer.untrained`). The same pairs
-    and settings give the same weights, whatever the number of threads.
+    With `start`, its network is fine-tuned; without a gain on the validation pairs, and where no pair has a
+    valid pixel, its weights are kept unchanged. With one, what it was before is kept beside it
+    (`EmbeddedEnhancer.untrained`). The same pairs and settings give the same weights, whatever the number of
+    threads.
 
     Args:
         pairs: training and validation pairs of the scene.
@@ -62,9 +64,16 @@ def train_on_scene(
         deterministic: train a plain regression instead of a diffusion; with `start`, as that one is.
 
     Raises:
+        CaptureError: without `start`, when no pair has a valid pixel: there is nothing to learn from.
         ConfigError: when no pair is left to train on, or the images are too small.
         DivergedError: when the loss stops being finite.
     """
+    seen = bool((pairs.weight > 0).any())
+    if start is None and not seen:
+        raise CaptureError(
+            "no training frame has a valid pixel that is not saturated, so that a restorer has nothing to "
+            "learn from; set enhance.pretrained_weights to bundled, or enhance.backend to classical"
+        )
     generator = torch.Generator().manual_seed(config.seed)
     chosen = pairs.subset(np.flatnonzero(~pairs.validation))
     gamut = Gamut.of_images(chosen.target, chosen.weight)
@@ -74,6 +83,9 @@ def train_on_scene(
         base = EmbeddedEnhancer(network, 1, 1, config.seed, False, gamut, {}, deterministic=deterministic)
         rate = config.learning_rate
     base = base.with_settings(config, gamut, patches)
+    if not seen:
+        # Nor is there anything to measure a gain by.
+        return replace(base, record={**base.record, "scene_training_kept": False})
     candidates = base.candidate_steps(config)
     before = {} if start is None else validation_scores(base, pairs, transfer, candidates)
     training = _SceneTraining(pairs, transfer, config, base, rate, generator, candidates, before)

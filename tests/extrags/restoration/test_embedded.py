@@ -13,7 +13,7 @@ import torch
 
 from extrags.config import CoarseConfig
 from extrags.depth.hidden import SOLID
-from extrags.errors import ConfigError, WeightsError
+from extrags.errors import CaptureError, ConfigError, WeightsError
 from extrags.events import Event, subscribed
 from extrags.metrics.image import SSIM_WINDOW_PX
 from extrags.restoration.backends import load_enhancer, train_enhancer
@@ -110,6 +110,23 @@ class TestEmbedded:
             kept.network.state_dict().values(), trained.network.state_dict().values(), strict=True
         ):
             assert torch.equal(one, two)
+
+    def test_without_a_valid_pixel_nothing_is_trained(
+        self, tube: Tube, tube_pairs: Pairs, trained: EmbeddedEnhancer, tmp_path: Path
+    ) -> None:
+        """As where all frames are saturated: there is no figure of anything, and none is told."""
+        hidden = replace(tube_pairs, weight=torch.zeros_like(tube_pairs.weight))
+        transfer = tube.references.transfer
+        kept = train_on_scene(hidden, transfer, SMALL, trained)
+        assert kept.record["scene_training_kept"] is False
+        assert never_trained_on(kept) is kept
+        for name, value in kept.network.state_dict().items():
+            assert torch.equal(value, trained.network.state_dict()[name])
+        judged = best_of_all([kept], hidden, transfer)
+        judged.save(tmp_path)
+        assert load_enhancer(tmp_path).name == "embedded"
+        with pytest.raises(CaptureError, match="valid pixel that is not saturated"):
+            train_on_scene(hidden, transfer, SMALL)
 
     def test_training_that_helps_is_kept(self, tube: Tube, tube_pairs: Pairs, clip: Clip, tmp_path) -> None:
         crude = train_on_scene(
