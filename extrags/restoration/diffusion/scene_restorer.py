@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from extrags.config import CoarseConfig, EnhanceConfig, SeamlessCloning
+from extrags.errors import ConfigError
 from extrags.events import MetricRecorded, emit
 from extrags.restoration.classical import ClassicalEnhancer
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer, pretrained
@@ -23,6 +24,7 @@ from extrags.restoration.diffusion.validation import (
     validation_pairs,
 )
 from extrags.restoration.protocol import Enhancer
+from extrags.restoration.training_data.augmentation import SMALLEST_CROP_PX
 from extrags.restoration.training_data.pairs import Pairs, make_pairs, usable_folds
 from extrags.restoration.uncertainty.calibration import Calibration
 from extrags.scene import Scene
@@ -52,13 +54,30 @@ def scene_restorer(
         CaptureError: with too few training frames to train on.
         DivergedError: when a reconstruction or the training does not stay finite.
         WeightsError: when the weights are missing or do not fit.
-        ConfigError: when there would be neither weights nor training.
+        ConfigError: when there would be neither weights nor training, or frames are too small to train on.
     """
+    _check_size(sequence, config)
     found = _judged_restorer(scene, sequence, config, coarse)
     # Of the one that serves: of two sets of weights the judge may prefer the less familiar one.
     if isinstance(found, EmbeddedEnhancer | ClassicalEnhancer):
         _tell_domain(found)
     return found
+
+
+def _check_size(sequence: EndoscopicSequence, config: EnhanceConfig) -> None:
+    """Refuse to train on frames without room for a crop, before what takes long.
+
+    Args:
+        sequence: frames at the size that they are restored at.
+        config: whether there is to be a training.
+    """
+    if config.train_iterations > 0 and min(sequence.width, sequence.height) < SMALLEST_CROP_PX:
+        raise ConfigError(
+            f"{sequence.name}: frames are restored at {sequence.width} x {sequence.height} px "
+            f"(enhance.max_width is {config.max_width}), and a restorer is trained on at least "
+            f"{SMALLEST_CROP_PX} px a side; set enhance.train_iterations to 0, or a larger enhance.max_width "
+            "where frames are larger"
+        )
 
 
 def _judged_restorer(

@@ -111,6 +111,15 @@ class TestEmbedded:
         ):
             assert torch.equal(one, two)
 
+    def test_frames_too_small_to_train_on_are_refused_before_any_is_left_out(
+        self, tube: Tube, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """The size is that of restored views: frames of 640 x 40 px are large enough, and restored at 20."""
+        monkeypatch.setattr(scene_restorer, "make_pairs", None)
+        config = SMALL.model_copy(update={"max_width": 32})
+        with pytest.raises(ConfigError, match=r"restored at 32 x 24 px \(enhance.max_width is 32\)"):
+            train_enhancer(tube.scene, tube.sequence, config, CoarseConfig())
+
     def test_without_a_valid_pixel_nothing_is_trained(
         self, tube: Tube, tube_pairs: Pairs, trained: EmbeddedEnhancer, tmp_path: Path
     ) -> None:
