@@ -21,7 +21,7 @@ __all__ = [
     "save_reconstruction",
 ]
 
-COARSE_VERSION = 18
+COARSE_VERSION = 19
 """Of the reconstruction, wherever it begins: scenes that go on from an earlier one follow it."""
 
 HISTORY = "history.json"

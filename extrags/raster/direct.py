@@ -42,6 +42,8 @@ class Target:
         depth_confidence: weight of the depth term per pixel, in [0, 1], [H, W]; None weights all equally.
         shown: pixels that belong to the picture, [H, W]; elsewhere the colour terms take rendering and target
             for black, as beyond the edge of the image. None: all.
+        saturated: channels of pixels that the colour terms take for white, in the target and where the
+            rendering is brighter still, [H, W, 3]; what is brighter has no gradient. None: none.
 
     Raises:
         ShapeError: when sizes do not fit together, or that of the image is out of range.
@@ -62,6 +64,7 @@ class Target:
         depth: Float[Tensor, "h w"] | None = None,
         depth_confidence: Float[Tensor, "h w"] | None = None,
         shown: Bool[Tensor, "h w"] | None = None,
+        saturated: Bool[Tensor, "h w 3"] | None = None,
     ) -> None:
         if rgb.ndim != 3 or rgb.shape[2] != 3:
             raise ShapeError(f"rgb has shape {tuple(rgb.shape)}, expected (H, W, 3)")
@@ -82,10 +85,14 @@ class Target:
         for name, image in images.items():
             if image is not None and image.shape != (self.height, self.width):
                 raise ShapeError(f"{name} has shape {image.shape}, expected {(self.height, self.width)}")
-        self.hidden = None if shown is None else _hidden_pixels(shown, self.rgb.shape[:2])
-        if self.hidden is not None:
+        self.hidden = None if shown is None else _flat("shown", ~shown, self.rgb.shape[:2])
+        self.saturated = None if saturated is None else _flat("saturated", saturated, self.rgb.shape)
+        if self.hidden is not None or self.saturated is not None:
             # The view's own colours may be in this memory.
             self.rgb = self.rgb.copy()
+        if self.saturated is not None:
+            self.rgb.reshape(-1)[self.saturated] = 1
+        if self.hidden is not None:
             self.rgb.reshape(-1, 3)[self.hidden] = 0
         self.viewmat = np.ascontiguousarray(viewmat, dtype=np.float32)
         self.K = np.ascontiguousarray(K, dtype=np.float32)
@@ -105,11 +112,11 @@ def _contiguous_array(values: Tensor) -> np.ndarray:
     return values.detach().to(torch.float32).contiguous().numpy()
 
 
-def _hidden_pixels(shown: Tensor, size: tuple[int, ...]) -> np.ndarray:
-    """Flat indices of the pixels that are not shown."""
-    if shown.shape != size:
-        raise ShapeError(f"shown has shape {tuple(shown.shape)}, expected {size}")
-    return np.flatnonzero(~shown.numpy())
+def _flat(name: str, chosen: Tensor, size: tuple[int, ...]) -> np.ndarray:
+    """Flat indices of what is chosen of an image."""
+    if chosen.shape != size:
+        raise ShapeError(f"{name} has shape {tuple(chosen.shape)}, expected {size}")
+    return np.flatnonzero(chosen.numpy())
 
 
 @dataclass(frozen=True)
@@ -145,7 +152,7 @@ class _Images:
     ) -> tuple[float, Any]:
         """The loss, and the kernels' struct of its gradients with respect to the images."""
         kernels, image = native.compiled_kernels(), self.arrays
-        with self._blank(target.hidden):
+        with self._no_brighter_than_white(target.saturated), self._blank(target.hidden):
             loss: float = kernels.l1_ssim(
                 image["rgb"],
                 target.rgb,
@@ -174,6 +181,20 @@ class _Images:
             if compared:
                 gradients |= {"depth": image["v_depth"], "depth_image": image["depth"]}
         return loss, kernels.ImageGradients(**gradients)
+
+    @contextmanager
+    def _no_brighter_than_white(self, saturated: np.ndarray | None) -> Iterator[None]:
+        """Saturated channels, as the loss sees them, and without a gradient where they are brighter."""
+        if saturated is None:
+            yield
+            return
+        colors = self.arrays["rgb"].reshape(-1)
+        brighter = saturated[colors[saturated] > 1]
+        rendered = colors[brighter]
+        colors[brighter] = 1
+        yield
+        colors[brighter] = rendered
+        self.arrays["v_rgb"].reshape(-1)[brighter] = 0
 
     @contextmanager
     def _blank(self, hidden: np.ndarray | None) -> Iterator[None]:

@@ -136,6 +136,10 @@ class AutogradStep:
         )
         like = rendering.rgb
         image, target = rendering.rgb[0], view.colors.to(like)
+        if (saturated := view.saturated) is not None:
+            saturated = saturated.to(like.device)
+            image = torch.where(saturated, image.clamp(max=1), image)
+            target = target.masked_fill(saturated, 1)
         if view.shown is not None:
             hidden = ~view.shown.to(like.device)[..., None]
             image, target = image.masked_fill(hidden, 0), target.masked_fill(hidden, 0)
@@ -289,6 +293,7 @@ class NativeStep:
             depth=view.depth_mm if self._schedule.depth_weight > 0 else None,
             depth_confidence=view.depth_confidence,
             shown=view.shown,
+            saturated=view.saturated,
         )
 
 

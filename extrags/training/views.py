@@ -18,7 +18,8 @@ from torch import Tensor
 
 from extrags.cameras import Cameras
 from extrags.frame_stacks import FrameStack
-from extrags.sequence import EndoscopicSequence, saturated_mask
+from extrags.sequence import EndoscopicSequence
+from extrags.thresholds import SATURATED
 
 __all__ = ["View", "depth_confidence", "epochs", "in_steps", "real_views"]
 
@@ -43,6 +44,8 @@ class View:
             target, as beyond the edge of the image, so that no window of SSIM compares it. None: all.
         least_weight: what smaller weights of pixels are raised to where they are stored in steps.
         weight_factor: of all weights of pixels.
+        saturating: saturated channels of `rgb` show that there is at least so much: what is rendered brighter
+            is as right.
     """
 
     camera: Cameras
@@ -57,11 +60,19 @@ class View:
     shown: Bool[Tensor, "h w"] | None = None
     least_weight: float = 0.0
     weight_factor: float = 1.0
+    saturating: bool = False
 
     @property
     def colors(self) -> Float[Tensor, "h w 3"]:
         """The target in [0, 1]; decoded anew whenever it is asked for."""
         return _from_steps(self.rgb)
+
+    @property
+    def saturated(self) -> Bool[Tensor, "h w 3"] | None:
+        """Channels of which the target only tells that they are white or brighter; None without any."""
+        if not self.saturating:
+            return None
+        return self.rgb >= (SATURATED if self.rgb.dtype == torch.uint8 else (SATURATED - 0.5) / 255)
 
     @property
     def weights(self) -> Float[Tensor, "h w"]:
@@ -132,7 +143,9 @@ def depth_confidence(expected_error: Float[np.ndarray, "*f h w"]) -> Float[np.nd
 
 
 def real_views(sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]) -> list[View]:
-    """The training frames as views; saturated pixels and specular highlights carry no weight.
+    """The training frames as views; highlights and pixels that are saturated in all channels weigh nothing.
+
+    Of others, a saturated channel tells that there is at least so much.
 
     Colours, and depth that is zero outside the mask already, share the memory of the sequence; what is made
     of many large frames lies in mapped files, as they do (`extrags.frame_stacks`).
@@ -145,8 +158,9 @@ def real_views(sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]) -> li
     picture: np.ndarray | None = None
     for position, frame in enumerate(frames):
         index = int(frame)
-        # A saturated channel says nothing about albedo.
-        weight = sequence.supervised_mask(index) & ~saturated_mask(sequence.rgb[index])
+        saturated = sequence.rgb[index] >= SATURATED
+        # Where all channels are, nothing tells a wall that is too near from a highlight.
+        weight = sequence.supervised_mask(index) & ~saturated.all(axis=-1)
         depth = confidence = None
         mask = sequence.mask[index]
         if sequence.depth_mm is not None:
@@ -171,6 +185,7 @@ def real_views(sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]) -> li
                 frame=position,
                 depth_confidence=confidence,
                 shown=shown,
+                saturating=bool(saturated.any()),
             )
         )
     return views

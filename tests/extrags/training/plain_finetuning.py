@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from jaxtyping import UInt8
 from torch import Tensor
 
 from extrags.config import CoarseConfig, FinetuneConfig
@@ -110,11 +111,12 @@ def pseudo_views(scene: Scene) -> PseudoViews:
 
 
 def masked(sequence: EndoscopicSequence) -> EndoscopicSequence:
-    """The tube's frames with a mask, a highlight and pixels without depth."""
+    """The tube's frames with a mask, a highlight, red that is saturated, and pixels without depth."""
     mask, depth = sequence.mask.copy(), np.array(sequence.depth_mm)
     mask[:, :, -6:] = False
     rgb = sequence.rgb.copy()
     rgb[:, 10:13, 10:20] = 255
+    rgb[:, 20:26, 12:30, 0] = 252
     depth[:, -5:] = 0
     return replace(sequence, rgb=rgb, mask=mask, depth_mm=depth)
 
@@ -163,6 +165,7 @@ class Plain:
     inverse: bool = True
     swap_lambda: bool = False
     beyond_mask: float = 0.0
+    white: float = 1.0
 
     def photometric(
         self, image: Tensor, target: Tensor, weight: Tensor, ssim_weight: Tensor, z: float, lam: float
@@ -207,18 +210,27 @@ class Plain:
     ) -> Tensor:  # fmt: skip
         frame = int(sequence.train[position])
         assert sequence.depth_mm is not None
-        rgb = double(sequence.rgb[frame] / np.float32(255))
-        valid = double(sequence.mask[frame] & (sequence.rgb[frame] < 250).all(-1))
+        valid = double(sequence.mask[frame] & (sequence.rgb[frame] < 250).any(-1))
+        shown, rgb = no_brighter_than_white(images.rgb, sequence.rgb[frame], self.white)
         lam = coarse.dssim_weight if config.dssim_weight is None else config.dssim_weight
         # Beyond the mask as beyond the edge of the image: black, in windows of SSIM too.
         seen = double(np.where(sequence.mask[frame], 1, self.beyond_mask))[..., None]
         loss = config.photometric_weight * self.photometric(
-            seen * images.rgb, seen * rgb, valid, valid, float(valid.sum()), lam
+            seen * shown, seen * rgb, valid, valid, float(valid.sum()), lam
         )
         depth = double(np.where(sequence.mask[frame], sequence.depth_mm[frame], 0))
         weight = plain_depth_weight(config, coarse, iteration)
         loss = loss + weight * self.inverse_depth(images.depth, images.alpha, depth, schedule.depth_scale)
         return loss + coarse.light.exposure_prior * light.log_exposure.square().mean()
+
+
+def no_brighter_than_white(
+    rendered: Tensor, frame: UInt8[np.ndarray, "h w 3"], white: float = 1.0
+) -> tuple[Tensor, Tensor]:
+    """A rendering and a frame: a saturated channel is white, and so is what is rendered brighter."""
+    saturated = torch.from_numpy(frame >= 250)
+    shown = torch.where(saturated, rendered.clamp(max=white), rendered)
+    return shown, torch.where(saturated, 1.0, double(frame / np.float32(255)))
 
 
 @dataclass(frozen=True)

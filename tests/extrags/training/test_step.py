@@ -51,6 +51,15 @@ def _masked(view: View) -> View:
     return replace(view, weight=shown, shown=shown)
 
 
+def _saturated(view: View) -> View:
+    """Red is saturated in a part of the picture, round as well."""
+    masked = _masked(view)
+    rgb = masked.rgb.clone()
+    rgb[4:20, 6:24, 0] = 251
+    rgb[:, -9:, 1] = 255
+    return replace(masked, rgb=rgb, saturating=True)
+
+
 SETTINGS: dict[str, DensifyConfig] = {
     "none": DensifyConfig(enabled=False),
     "absgrad": DensifyConfig(absgrad=True),
@@ -60,7 +69,7 @@ SETTINGS: dict[str, DensifyConfig] = {
 
 class TestOneStep:
     @pytest.mark.parametrize("lit", [True, False])
-    @pytest.mark.parametrize("change", [_weighted, _virtual, _masked])
+    @pytest.mark.parametrize("change", [_weighted, _virtual, _masked, _saturated])
     @pytest.mark.parametrize("setting", SETTINGS)
     def test_loss_and_gradients_are_those_of_autograd(
         self, tube_sequence: EndoscopicSequence, setting: str, change: Callable[[View], View], lit: bool
@@ -127,6 +136,40 @@ class TestOneStep:
             found.append((observation.loss, gradient))
         assert found[0][0] == found[1][0]
         assert torch.equal(found[0][1], found[1][1])
+
+    @pytest.mark.parametrize("native_kernels", [True, False])
+    def test_what_is_brighter_than_a_saturated_channel_is_as_right(
+        self, tube_sequence: EndoscopicSequence, native_kernels: bool
+    ) -> None:
+        """By which factor it is brighter makes no difference; what is darker is pulled up."""
+        view = real_views(tube_sequence, tube_sequence.train)[1]
+        assert view.frame is not None
+        view = replace(view, rgb=torch.full_like(view.rgb, 255), saturating=True, depth_mm=None)
+        scene = shaken_scene(lit=True)
+        assert scene.light is not None
+        schedule = step_schedule()
+        density = density_strategy(schedule.densify, 20.0, 30, len(scene.gaussians), seed=0)
+        found = {}
+        for factor in (0.3, 30.0, 60.0):
+            exposure = torch.zeros_like(scene.light.log_exposure)
+            exposure[view.frame] = 2 * np.log(factor)
+            lit = replace(scene, light=replace(scene.light, log_exposure=exposure))
+            step = (NativeStep if native_kernels else AutogradStep)(lit, schedule)
+            observation = step.differentiate(replace(view, weight=view.weight), 7, density)
+            rendered = observation.rendering.rgb[0].detach()
+            if isinstance(step, NativeStep):
+                assert step.direct is not None
+                gradient = step.direct.gradients["sh"][:, 0].clone()
+            else:
+                means = step.adam.parameters["sh0"].grad
+                assert means is not None
+                gradient = means[:, 0].clone()
+            found[factor] = (rendered, gradient)
+        darker, brighter = found[0.3][1], found[60.0][1]
+        # Descending along it brightens; holes alone are darker than white where all else is brighter.
+        assert float(darker.sum()) < 0
+        assert float((found[60.0][0] > 1).float().mean()) > 0.5
+        assert float(brighter.abs().sum()) < 0.2 * float(darker.abs().sum())
 
     @pytest.mark.parametrize("iteration", [3, 4000])
     @pytest.mark.parametrize("degree", [0, 1, 3])

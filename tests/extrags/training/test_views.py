@@ -14,7 +14,7 @@ from extrags.config import CoarseConfig, FinetuneConfig
 from extrags.pseudo_views import PseudoViews
 from extrags.raster import native
 from extrags.scene import Scene
-from extrags.sequence import EndoscopicSequence, saturated_mask
+from extrags.sequence import EndoscopicSequence
 from extrags.training import finetuning
 from extrags.training.finetuning import finetune
 from extrags.training.optimise import TrainingResult
@@ -37,7 +37,7 @@ def in_floats(view: View) -> View:
 def plain_view(sequence: EndoscopicSequence, frame: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Colours, weights and depth of a frame, each as a float32 image of its own."""
     assert sequence.depth_mm is not None
-    weight = sequence.supervised_mask(frame) & ~saturated_mask(sequence.rgb[frame])
+    weight = sequence.supervised_mask(frame) & (sequence.rgb[frame] < 250).any(axis=-1)
     depth = np.where(sequence.mask[frame], sequence.depth_mm[frame], 0)
     return (
         sequence.rgb[frame].astype(np.float32) / 255,
@@ -56,6 +56,20 @@ class TestRealViews:
             assert np.array_equal(view.weights.numpy(), weight)
             assert np.array_equal(view.depth_mm.numpy(), depth)
             assert 0 < weight.mean() < 1
+
+    def test_a_saturated_channel_tells_that_there_is_at_least_so_much(
+        self, sequence: EndoscopicSequence
+    ) -> None:
+        rgb = sequence.rgb.clip(0, 249)
+        rgb[sequence.train[0], 3:5, 4:9, 0] = 250
+        rgb[sequence.train[0], 6, 4:9] = 255
+        first, second = real_views(replace(sequence, rgb=rgb, specular=None), sequence.train[:2])
+        assert first.saturated is not None
+        assert np.array_equal(first.saturated.numpy(), rgb[sequence.train[0]] >= 250)
+        assert bool((first.weights[3:5, 4:9] == 1).all())
+        # White altogether: a wall that is too near, or a highlight.
+        assert bool((first.weights[6, 4:9] == 0).all())
+        assert second.saturated is None
 
     def test_a_pixel_takes_one_byte_besides_the_sequence(self, tube_sequence: EndoscopicSequence) -> None:
         frame = int(tube_sequence.train[0])
