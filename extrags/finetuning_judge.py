@@ -8,12 +8,9 @@ compared on them. Held-out frames are never used.
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
-from typing import ClassVar
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -24,21 +21,21 @@ from extrags.confidence import PerceptualDifference
 from extrags.config import DEFAULT_PROFILE, PROFILES, CoarseConfig, EnhanceConfig, FinetuneConfig
 from extrags.evaluation import render
 from extrags.events import MetricRecorded, Progress, emit
+from extrags.finetuning_judgement import Judgement, Trial, decide
 from extrags.metrics.image import psnr_per_image
 from extrags.metrics.lpips import MIN_SIDE_PX
 from extrags.pseudo_views import PseudoViews
 from extrags.restoration.protocol import Enhancer, among_kept, never_trained_on
-from extrags.restoration.restored_renders import RestoredShares, restored_shares
+from extrags.restoration.restored_renders import restored_shares
 from extrags.restoration.trajectories import restored_batches
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence, Split
-from extrags.store.storable import Storable
 from extrags.threads import one_torch_thread
 from extrags.training.finetuning import finetune
 from extrags.training.frame_weights import FrameWeights, frame_weights
 from extrags.training.leave_out import MIN_FRAMES, leave_out_folds, partial_scene, show_tissue
 
-__all__ = ["AMOUNTS", "Judgement", "Trial", "decide", "judge_finetuning"]
+__all__ = ["AMOUNTS", "judge_finetuning"]
 
 logger = logging.getLogger(__name__)
 
@@ -49,6 +46,12 @@ AMOUNTS = (1.0, 0.3, 0.1)
 MIN_LEFT_OUT = 4
 """Two or three frames say too little of how PSNR changes: then a trial leaves out others as well, in a second
 reconstruction."""
+
+
+SMALL_ERROR = 0.02
+"""Of values in [0, 1]. Virtual views that at full weight add no more to the left-out frames than is hardly
+seen are guesses good enough for holes; those of a restorer that does not know what it sees add several times
+that."""
 
 
 COMPARED_FRAMES = 8
@@ -62,89 +65,6 @@ KEPT = (
     "rebuilt from frames"
 )
 """Of `finetune.keep_scene`, in words."""
-
-
-@dataclass(frozen=True)
-class Trial:
-    """One way to fine-tune, tried on left-out frames.
-
-    Args:
-        amount: factor of `finetune.pseudo_weight`.
-        coarse_psnr_db: mean PSNR of the trial's coarse scene on the left-out frames.
-        final_psnr_db: the same after its fine-tuning.
-        gain_db: mean difference of the two, frame by frame.
-        standard_error_db: of that mean.
-        over_control_db: mean difference to the control, frame by frame.
-        over_control_error_db: standard error of that mean.
-    """
-
-    amount: float
-    coarse_psnr_db: float
-    final_psnr_db: float
-    gain_db: float
-    standard_error_db: float
-    over_control_db: float
-    over_control_error_db: float
-
-    def holds(self, max_loss_db: float) -> bool:
-        """Whether left-out frames keep their quality.
-
-        The mean may fall behind the coarse scene's by `max_loss_db`. Behind the control it may fall by its
-        standard error more: with few frames a difference that small is no evidence, and a scene that gives
-        its virtual views up has nothing where no real view looked.
-        """
-        behind_control_db = -(self.over_control_db + self.over_control_error_db)
-        return self.gain_db >= -max_loss_db and behind_control_db <= max_loss_db
-
-
-@dataclass(frozen=True)
-class Judgement(Storable):
-    """How much of the fine-tuning is kept, and why.
-
-    Args:
-        amount: factor of `finetune.pseudo_weight`; 0 fine-tunes on real views alone; None keeps the coarse
-            scene.
-        reason: in words, with the number it rests on.
-        trials: in the order they were made.
-        left_out: positions, among the training frames, of the frames left out.
-        restored_shares: how much of views restored in the image serves, from the trial that is kept; None
-            where that was not measured.
-    """
-
-    stored_as: ClassVar[str] = "judgement.json"
-
-    amount: float | None
-    reason: str
-    trials: tuple[Trial, ...] = ()
-    left_out: tuple[int, ...] = ()
-    restored_shares: RestoredShares | None = None
-
-    def applied_to(self, config: FinetuneConfig) -> FinetuneConfig:
-        """The settings with the weight of virtual views that is kept, and their share in further rounds.
-
-        Shares become no larger than left-out frames allow. For amounts above zero; others change nothing.
-        """
-        if not self.amount:
-            return config
-        changes = {"pseudo_weight": self.amount * config.pseudo_weight}
-        if self.restored_shares is not None and self.restored_shares != RestoredShares():
-            changes["known_share"] = min(config.known_share, self.restored_shares.known)
-            changes["invented_share"] = min(config.invented_share, self.restored_shares.invented)
-        return config.model_copy(update=changes)
-
-    def save(self, path: Path) -> None:
-        """Write as JSON."""
-        path.write_text(json.dumps(asdict(self), indent=1) + "\n")
-
-    @classmethod
-    def load(cls, path: Path) -> Judgement:
-        """Read what `save` wrote."""
-        values = json.loads(path.read_bytes())
-        trials = tuple(Trial(**trial) for trial in values["trials"])
-        left_out = tuple(values["left_out"])
-        shares = values["restored_shares"]
-        shares = None if shares is None else RestoredShares(**shares)
-        return cls(values["amount"], values["reason"], trials, left_out, shares)
 
 
 @one_torch_thread()
@@ -169,7 +89,9 @@ def judge_finetuning(
     largest of `AMOUNTS` is kept with which the left-out frames come within `finetune.judge.max_loss_db` of
     the coarse scene and, within noise, of the control (`Trial.holds`); else the control, if it holds against
     the coarse scene; else nothing. Where the control is what could be kept, it is tried as it would be run:
-    with the cool-down of its light.
+    with the cool-down of its light. If it holds, and virtual views did small harm (`SMALL_ERROR`), they are
+    tried once more, on its holes alone (`finetune.holes_only`), and fill these where the left-out frames hold
+    so, too: frames near the path see few holes, and cannot tell alone whether these are filled well.
 
     Args:
         scene: the coarse scene, trained on `sequence.train`; trials are optimised where it is.
@@ -223,19 +145,32 @@ def judge_finetuning(
     ):
         # What could still be kept is real views alone, whose light then comes to rest.
         scenes[0.0] = _finetuned(arms, 0.0, config, coarse, cooldown=True)
-        alone = _psnr_of_arms(arms, scenes[0.0])
-        trials[0] = _trial(0.0, before, alone, alone)
+        control = _psnr_of_arms(arms, scenes[0.0])
+        trials[0] = _trial(0.0, before, control, control)
+    filled: list[Scene] = []
+    if (
+        enhancer is not None
+        and trials[0].holds(settings.max_loss_db)
+        and not trials[-1].holds(settings.max_loss_db)
+        and trials[1].added_error(trials[0]) <= SMALL_ERROR
+        and not config.keep_scene
+        and not config.holes_only
+    ):
+        filled = _filled(arms, scenes[0.0], config, coarse)
+        trials.append(replace(_trial(1.0, before, _psnr_of_arms(arms, filled), control), holes_only=True))
     for trial in trials:
-        emit(MetricRecorded("finetune", f"left_out_gain_db_at_{trial.amount:g}", trial.gain_db))
+        where = "in_holes" if trial.holes_only else f"{trial.amount:g}"
+        emit(MetricRecorded("finetune", f"left_out_gain_db_at_{where}", trial.gain_db))
     left = np.sort(np.concatenate([arm.left_out for arm in arms]))
     judgement = decide(trials, settings.max_loss_db, left)
     if config.keep_scene:
         judgement = replace(judgement, reason=f"{KEPT}; {judgement.reason}")
     if enhancer is not None:
         share = np.mean([_error_share(scene, sequence, arm.start, arm.sequence) for arm in arms])
+        finals = filled if judgement.holes_only else scenes[judgement.amount]
         shown = (
             (arm.start, render(final, arm.sequence), arm.sequence)
-            for arm, final in zip(arms, scenes[judgement.amount], strict=True)
+            for arm, final in zip(arms, finals, strict=True)
         )
         shares = restored_shares(
             shown, enhancer, enhance, error_share=float(share), kept=[arm.kept for arm in arms]
@@ -312,15 +247,11 @@ def _finetuned(
     cooldown: bool = False,
 ) -> list[Scene]:
     """The brief reconstructions after fine-tuning as brief, on real views alone for an amount of 0."""
-    # Whether guesses harm shows in the first round; the others go on from what it makes.
-    config = config.first_round
-    changes: dict[str, float] = {
-        "iterations": max(1, round(config.judge.iterations_share * config.iterations)),
-        "light_cooldown_share": config.light_cooldown_share if cooldown else 0.0,
-    }
+    brief = _brief(config)
+    changes = {"light_cooldown_share": config.light_cooldown_share if cooldown else 0.0}
     if amount > 0:
         changes["pseudo_weight"] = amount * config.pseudo_weight
-    brief = config.model_copy(update=changes)
+    brief = brief.model_copy(update=changes)
     return [
         finetune(
             arm.start,
@@ -333,6 +264,33 @@ def _finetuned(
         ).scene
         for arm in arms
     ]
+
+
+def _filled(
+    arms: Sequence[_Arm], scenes: Sequence[Scene], config: FinetuneConfig, coarse: CoarseConfig
+) -> list[Scene]:
+    """The scenes of real views alone, with their holes filled from virtual ones, as briefly."""
+    filling = _brief(config).model_copy(update={"holes_only": True}).parts[-1]
+    return [
+        finetune(
+            scene,
+            arm.sequence,
+            arm.views,
+            filling,
+            coarse,
+            stage="finetune-judge",
+            frame_weights=arm.frame_weights,
+        ).scene
+        for arm, scene in zip(arms, scenes, strict=True)
+    ]
+
+
+def _brief(config: FinetuneConfig) -> FinetuneConfig:
+    """Settings of a trial."""
+    # Whether guesses harm shows in the first round; the others go on from what it makes.
+    config = config.first_round
+    iterations = max(1, round(config.judge.iterations_share * config.iterations))
+    return config.model_copy(update={"iterations": iterations})
 
 
 def _psnr_of_arms(arms: Sequence[_Arm], scenes: Sequence[Scene]) -> list[float]:
@@ -439,44 +397,3 @@ def _trial(amount: float, before: list[float], after: list[float], control: list
 def _mean_and_error(values: Float[np.ndarray, "n"]) -> tuple[float, float]:
     error = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else 0.0
     return float(values.mean()), float(error)
-
-
-def decide(trials: Sequence[Trial], max_loss_db: float, left: Int[np.ndarray, "m"]) -> Judgement:
-    """The judgement on trials.
-
-    Args:
-        trials: the control first, then falling amounts, of which the last alone may hold.
-        max_loss_db: mean PSNR that left-out frames may lose.
-        left: positions, among the training frames, of the frames left out.
-    """
-    control, last = trials[0], trials[-1]
-    names = ["real views alone", *(f"weight x {trial.amount:g}" for trial in trials[1:])]
-    changes = ", ".join(
-        f"{trial.gain_db:+.2f} dB ({name})" for name, trial in zip(names, trials, strict=True)
-    )
-    frames = f"on {len(left)} training frames left out of a trial, fine-tuning changes PSNR by {changes}"
-    amount: float | None = None
-    if last.amount > 0 and last.holds(max_loss_db):
-        amount = last.amount
-        outcome = "virtual views are kept"
-        if amount < 1:
-            outcome = f"virtual views weigh {amount:g} of finetune.pseudo_weight"
-        # They may be kept with less gain than real views alone: the rule has to stand beside the numbers.
-        outcome += (
-            ": with them these frames, which lie near the path, lose no more than "
-            f"{max_loss_db:g} dB against the coarse scene and, but for the standard error of that "
-            "difference, against real views alone"
-        )
-    elif control.holds(max_loss_db):
-        amount = 0.0
-        outcome = "fine-tuning is on real views alone"
-    else:
-        why = f"all lose more than {max_loss_db:g} dB"
-        if any(trial.gain_db >= -max_loss_db for trial in trials):
-            # Virtual views were compared with real ones whose light did not come to rest.
-            why = (
-                f"real views alone lose more than {max_loss_db:g} dB where their light comes to rest, and "
-                "virtual ones fall behind them where it does not"
-            )
-        outcome = f"{why}: the coarse scene is kept"
-    return Judgement(amount, f"{frames}; {outcome}", tuple(trials), tuple(left.tolist()))

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from extrags.confidence import PerceptualDifference
     from extrags.depth.estimate import DepthEstimate
     from extrags.exploration import Exploration
-    from extrags.finetuning_judge import Judgement
+    from extrags.finetuning_judgement import Judgement
     from extrags.freespace import FreeSpace
     from extrags.metrics.protocol import EvaluationResult, RenderedViews
     from extrags.metrics.surface import TrueSurface

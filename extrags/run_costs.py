@@ -100,6 +100,7 @@ WORKLOAD_SETTINGS = (
     "enhance.steps",
     "enhance.train_iterations",
     "finetune.growth",
+    "finetune.holes_only",
     "finetune.iterations",
     "finetune.keep_scene",
     "finetune.rounds",
@@ -437,6 +438,8 @@ def beyond_the_fit(task: str, config: PipelineConfig, *, devices: bool = True) -
         found.append(f"depth.monocular={config.depth.monocular}")
     if task in ("finetune", "finetune-judge") and config.finetune.keep_scene:
         found.append("finetune.keep_scene=true")
+    if task in ("finetune", "finetune-judge") and config.finetune.holes_only:
+        found.append("finetune.holes_only=true")
     if devices and cost_of(task).on_device and config.device == "cuda":
         found.append("device=cuda")
     if devices and task == "depth" and config.depth.device == "cuda":

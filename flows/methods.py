@@ -268,6 +268,7 @@ def paper(config: PipelineConfig) -> dict[str, Any]:
         "finetune.seed_holes": False,
         "finetune.keep_known": False,
         "finetune.keep_scene": False,
+        "finetune.holes_only": False,
         "finetune.confidence_floor": 0.0,
         "finetune.image_confidence": True,
         "finetune.light_cooldown_share": 0.0,

@@ -323,7 +323,7 @@ class SequenceRun(CachedStages):
 
     def finetune(self) -> None:
         """The final scene; there is none where the judge keeps the coarse one."""
-        from extrags.finetuning_judge import Judgement
+        from extrags.finetuning_judgement import Judgement
         from extrags.restoration.restored_renders import RestoredShares
 
         with self._stage("finetune") as row:

@@ -21,7 +21,7 @@ def finetuning_settings(config: FinetuneConfig) -> FinetuneConfig:
 
 
 # The weights' digest is in the key; where their file lies is not. Batches only bound the memory.
-@stage("finetune-judge", version=33, ignore=("weights", "clips_per_batch"))
+@stage("finetune-judge", version=34, ignore=("weights", "clips_per_batch"))
 def judge(
     slot: Slot,
     scene: Ref,

@@ -30,6 +30,8 @@ class JudgeConfig(StageConfig):
 
 EARLIER_GROWTH_SHARE = 0.8
 """Of `finetune.growth`, before the last of several rounds."""
+FILLING_SHARE = 0.5
+"""Iterations of filling holes after `finetune.iterations` on real views alone, as a share of these."""
 
 
 class FinetuneConfig(StageConfig):
@@ -107,6 +109,11 @@ class FinetuneConfig(StageConfig):
         description="the scene's own Gaussians and light stay: only new ones in holes are learned. "
         "imported.keep switches it on for imported scenes",
     )
+    holes_only: bool = Field(
+        False,
+        description="virtual views only fill holes: real ones train the scene alone, whose Gaussians and "
+        "light then stay. The judge switches it on where virtual views harm what is known else",
+    )
     confidence_floor: float = Field(
         0.1, ge=0, le=1, description="smallest pixel-level weight, so that no pixel drifts freely"
     )
@@ -134,6 +141,16 @@ class FinetuneConfig(StageConfig):
         """The iterations of each round: as even as they can be."""
         ends = [round(self.iterations * (number + 1) / self.rounds) for number in range(self.rounds)]
         return tuple(end - begin for begin, end in zip([0, *ends[:-1]], ends, strict=True))
+
+    @property
+    def parts(self) -> tuple[FinetuneConfig, ...]:
+        """Settings of what runs one after the other where there are virtual views."""
+        if not self.holes_only:
+            return (self,)
+        filling = {"keep_scene": True, "iterations": max(1, round(FILLING_SHARE * self.iterations))}
+        return tuple(
+            self.model_copy(update={"holes_only": False, "rounds": 1, **changes}) for changes in ({}, filling)
+        )
 
     @property
     def growth_before_last(self) -> float:

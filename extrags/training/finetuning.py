@@ -76,6 +76,9 @@ def finetune(
     With `keep_scene` the scene's own Gaussians and its light stay as they are: only new ones in holes are
     learned, without densification; where there are none, the Gaussians are returned as they were given.
 
+    With `holes_only` virtual views do no more than that: real views alone train the scene first, with all
+    iterations, and then virtual ones fill its holes with half as many.
+
     Args:
         scene: the coarse scene; the optimisation runs where it is, and so does the result.
         sequence: posed frames; only training frames are used.
@@ -99,9 +102,10 @@ def finetune(
     with one_torch_thread():
         config = PROFILES[DEFAULT_PROFILE].finetune if config is None else config
         coarse = PROFILES[DEFAULT_PROFILE].coarse if coarse is None else coarse
+        parts = config.parts
         if pseudo_views is None:
-            config = config.model_copy(update={"rounds": 1})
-        load = pseudo_views if callable(pseudo_views) else _loaded_once(pseudo_views, config.rounds)
+            parts = (config.model_copy(update={"rounds": 1, "holes_only": False}),)
+        load = pseudo_views if callable(pseudo_views) else _loaded_once(pseudo_views, parts[-1].rounds)
         del pseudo_views
         seen_from = [sequence.cameras[sequence.train]]
 
@@ -111,24 +115,29 @@ def finetune(
                 seen_from.append(views.cameras)
             return views
 
-        if config.rounds > 1 and coarse.inconsistent_frames == "weight" and frame_weights is None:
+        rounds = [(part, number) for part in parts for number in range(part.rounds)]
+        if len(rounds) > 1 and coarse.inconsistent_frames == "weight" and frame_weights is None:
             # Once for all rounds.
             frame_weights = found_weights(sequence, sequence.train)
-        current, history = scene, []
-        for number in range(config.rounds):
+        current, history, before = scene, [], 0
+        for part, number in rounds:
+            if number == 0:
+                fixed = len(current.gaussians)
             found = _round(
                 number,
                 current,
-                remembered,
+                remembered if part is parts[-1] else _none,
                 sequence,
-                config,
+                part,
                 coarse,
                 stage=stage,
                 frame_weights=frame_weights,
-                fixed=len(scene.gaussians),
+                fixed=fixed,
+                before=before,
+                of=sum(each.iterations for each in parts),
             )
-            before = sum(config.steps_of_rounds[:number])
             history += [{**entry, "iteration": entry["iteration"] + before} for entry in found.history]
+            before += part.steps_of_rounds[number]
             current = found.scene
         if coarse.one_sided:
             current = with_facing(current, seen_from)
@@ -139,6 +148,10 @@ def _loaded_once(pseudo_views: PseudoViews | None, rounds: int) -> Callable[[], 
     """What hands virtual views out that are in memory anyway; in the last round, for good."""
     held = [pseudo_views] * rounds
     return held.pop
+
+
+def _none() -> None:
+    """Loads no virtual views."""
 
 
 def _round(
@@ -152,8 +165,13 @@ def _round(
     stage: str,
     frame_weights: FrameWeights | None,
     fixed: int,
+    before: int,
+    of: int,
 ) -> TrainingResult:
-    """One round of `finetune`; with `keep_scene` the first `fixed` Gaussians stay as they are."""
+    """One round of `finetune`; with `keep_scene` the first `fixed` Gaussians stay as they are.
+
+    It follows the iterations `before` it, `of` all.
+    """
     frames, last = sequence.train, number == config.rounds - 1
     depth = median_depth(sequence, frames)
     growth = config.growth if last else config.growth_before_last
@@ -201,8 +219,8 @@ def _round(
         schedule,
         photometric_weight=config.photometric_weight,
         light_cooldown_share=cooldown_share,
-        iterations_before=sum(config.steps_of_rounds[:number]),
-        iterations_after=sum(config.steps_of_rounds[number + 1 :]),
+        iterations_before=before,
+        iterations_after=of - before - steps,
     ).resumed(seed=config.seed)
     if config.keep_scene:
         return optimise(

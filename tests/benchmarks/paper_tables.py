@@ -182,7 +182,7 @@ def judge_table(store: Path) -> str:
     ]
     for made, manifest in sorted(manifests, key=lambda found: int(found[0]["version"])):
         judged = json.loads((manifest.parent / "judgement.json").read_text())
-        gains = {trial["amount"]: trial for trial in judged["trials"]}
+        gains = {trial["amount"]: trial for trial in judged["trials"] if not trial.get("holes_only")}
         if not gains:
             continue
         settings = made["config"]["config"]
@@ -196,7 +196,9 @@ def judge_table(store: Path) -> str:
                 else "{gain_db:+.2f} ± {standard_error_db:.2f}".format(**gains[amount])
                 for amount in (0.0, *AMOUNTS)
             ),
-            KEPT.get(judged["amount"], f"weight x {judged['amount']}"),
+            "in holes alone"
+            if judged.get("holes_only")
+            else KEPT.get(judged["amount"], f"weight x {judged['amount']}"),
         ]
     head = ["sequence", "iterations", "seed", "frames left out", "real views alone"]
     head += [*(f"weight x {amount:g}" for amount in AMOUNTS), "kept"]

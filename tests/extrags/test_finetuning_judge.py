@@ -14,7 +14,8 @@ from extrags.cameras import Cameras
 from extrags.confidence import PerceptualDifference
 from extrags.config import CoarseConfig, DensifyConfig, EnhanceConfig, FinetuneConfig
 from extrags.config.finetuning import JudgeConfig
-from extrags.finetuning_judge import AMOUNTS, Judgement, Trial, decide, judge_finetuning
+from extrags.finetuning_judge import AMOUNTS, judge_finetuning
+from extrags.finetuning_judgement import Judgement, Trial, decide
 from extrags.metrics.lpips import Lpips
 from extrags.restoration.benchmark.variants import AsRendered
 from extrags.restoration.classical import ClassicalEnhancer
@@ -127,12 +128,72 @@ def test_why_neither_holds() -> None:
     assert "all lose more than 0.1 dB" in decide([alone, trial(0.1, -0.5, -0.3)], 0.1, np.array([3])).reason
 
 
+@pytest.mark.parametrize(("filled_db", "kept"), [(31.15, True), (31.0, False), (29.8, False)])
+def test_what_harms_the_known_may_fill_holes(
+    tube: Tube, monkeypatch: pytest.MonkeyPatch, filled_db: float, kept: bool
+) -> None:
+    """No weight holds beside a control that does: virtual views are tried where it leaves holes alone."""
+    # Before, the control, three weights, the control with its cool-down, and its holes filled.
+    measured = iter([30.0, 31.0, 29.5, 29.6, 29.8, 31.2, filled_db])
+    monkeypatch.setattr(finetuning_judge, "_psnr_db", lambda *_: [next(measured)])
+    monkeypatch.setattr(finetuning_judge, "MIN_LEFT_OUT", 1)
+    tried: list[tuple[Scene, FinetuneConfig, Scene]] = []
+
+    def recorded(scene: Scene, *given: Any, **named: Any) -> TrainingResult:
+        result = finetuning_judge_finetune(scene, *given, **named)
+        tried.append((scene, given[2], result.scene))
+        return result
+
+    finetuning_judge_finetune = finetuning_judge.finetune
+    monkeypatch.setattr(finetuning_judge, "finetune", recorded)
+    found = judged(tube, ClassicalEnhancer(""))
+    assert [trial.holes_only for trial in found.trials] == [False] * 4 + [True]
+    assert found.trials[-1].over_control_db == pytest.approx(filled_db - 31.2)
+    assert (found.amount, found.holes_only) == ((1.0, True) if kept else (0.0, False))
+    assert ("only fill its holes" in found.reason) == kept
+    assert "(in holes alone)" in found.reason
+    # It goes on from the control whose light came to rest, and leaves what is there.
+    *_, alone, (start, config, _) = tried
+    assert start is alone[2]
+    assert (config.keep_scene, config.rounds, config.iterations) == (True, 1, BRIEF.iterations // 2)
+    settings = found.applied_to(BRIEF)
+    assert (settings.holes_only, settings.pseudo_weight) == (kept, BRIEF.pseudo_weight)
+
+
+def test_a_restorer_that_does_visible_harm_fills_no_holes(
+    tube: Tube, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Frames near the path see few holes, and would not tell."""
+    measured = iter([30.0, 31.0, 28.0, 29.5, 29.8, 31.2])
+    monkeypatch.setattr(finetuning_judge, "_psnr_db", lambda *_: [next(measured)])
+    monkeypatch.setattr(finetuning_judge, "MIN_LEFT_OUT", 1)
+    found = judged(tube, ClassicalEnhancer(""))
+    assert (found.amount, found.holes_only) == (0.0, False)
+    # 0.0398 and 0.0275 of 1.
+    control, full, *_ = found.trials
+    assert full.added_error(control) == pytest.approx(np.sqrt(0.0398107**2 - 0.0275423**2), rel=1e-5)
+    assert control.added_error(full) == 0
+
+
+@pytest.mark.parametrize("settings", [{"keep_scene": True}, {"holes_only": True}])
+def test_holes_alone_are_not_tried_twice(
+    tube: Tube, monkeypatch: pytest.MonkeyPatch, settings: dict[str, bool]
+) -> None:
+    measured = iter([30.0, 31.0, 29.5, 29.6, 29.8, 31.2])
+    monkeypatch.setattr(finetuning_judge, "_psnr_db", lambda *_: [next(measured)])
+    monkeypatch.setattr(finetuning_judge, "MIN_LEFT_OUT", 1)
+    found = judged(tube, ClassicalEnhancer(""), BRIEF.model_copy(update=settings))
+    assert (found.amount, found.holes_only) == (0.0, False)
+
+
 def test_a_restorer_that_destroys_is_left_out(tube: Tube) -> None:
     # Scenes as brief as these gain by anything: what is green has to be most of what they are shown.
     config = FINETUNE.model_copy(update={"keep_known": False, "pseudo_share": 0.9, "pseudo_share_final": 0.8})
     destroyed = judged(tube, Destroyer(""), config, COARSE)
     assert destroyed.amount == 0.0 or destroyed.amount is None
-    assert [trial.amount for trial in destroyed.trials] == [0.0, *AMOUNTS]
+    weighed = [trial.amount for trial in destroyed.trials if not trial.holes_only]
+    assert weighed == [0.0, *AMOUNTS]
+    assert not destroyed.holes_only
     control, full, *_ = destroyed.trials
     assert full.gain_db < control.gain_db - 0.1
     # What could be kept is tried as it would be run, which is what runs without a restorer.
@@ -404,9 +465,11 @@ def test_the_weight_of_virtual_views_follows() -> None:
 
 
 def test_storage(tmp_path: Path) -> None:
+    filled = replace(trial(1.0, 0.2, 0.5), holes_only=True)
     for amount in (None, 0.0, 1.0):
         found = Judgement(
             amount, "why", (trial(0.0, 0.5, 0.5), trial(1.0, -0.25, 0.5, 0.2)), (2, 5), RestoredShares(0.25)
         )
+        found = replace(found, holes_only=amount == 1, trials=(*found.trials, filled))
         found.save(tmp_path / "judgement.json")
         assert Judgement.load(tmp_path / "judgement.json") == found

@@ -273,6 +273,7 @@ class TestRestorer:
             ),
             ({"enhance.train_iterations": 9, "enhance.steps": 1}, {"enhance-train"}),
             ({"finetune.keep_scene": True}, {"finetune", "finetune-judge"}),
+            ({"finetune.holes_only": True}, {"finetune", "finetune-judge"}),
             ({"uc_nerf.enabled": True}, {"coarse", "evaluate-render"}),
         ],
     )

@@ -135,6 +135,7 @@ DIRECTLY: dict[str, tuple[str, ...]] = {
     "finetune.judge.views": ("plan", "finetune-judge"),
     "finetune.judge.*": ("finetune-judge",),
     "finetune.growth": ("plan", "finetune-judge", "finetune"),
+    "finetune.holes_only": ("plan", "finetune-judge", "finetune"),
     "finetune.keep_scene": ("plan", "finetune-judge", "finetune"),
     "finetune.rounds": ("plan", "finetune-judge", "finetune"),
     "finetune.iterations": ("plan", "finetune-judge", "finetune"),

@@ -13,7 +13,7 @@ from typing import Any
 from unittest.mock import patch
 
 from extrags.config import PipelineConfig
-from extrags.finetuning_judge import Judgement
+from extrags.finetuning_judgement import Judgement
 from extrags.scene_plan import ScenePlan, decide
 from extrags.store import Manifest, Ref, digest_of
 from flows.outcome import SequenceOutcome

@@ -24,7 +24,7 @@ import flows.wiring
 from extrags.config import PipelineConfig
 from extrags.config.settings import Setting, settings_of
 from extrags.errors import ConfigError
-from extrags.finetuning_judge import Judgement
+from extrags.finetuning_judgement import Judgement
 from extrags.restoration.restored_renders import RestoredShares
 from extrags.store import Store
 from flows.runners import DirectRunner, StoreRunner

@@ -195,6 +195,54 @@ class TestRounds:
             assert torch.equal(found.parameters()[name][:N_GAUSSIANS], values), name
 
 
+def assert_same_scene(one: Scene, other: Scene) -> None:
+    for name, values in one.detached().gaussians.parameters().items():
+        assert torch.equal(other.detached().gaussians.parameters()[name], values), name
+    assert one.light is not None
+    assert other.light is not None
+    for name, values in one.light.detached().parameters().items():
+        assert torch.equal(other.light.detached().parameters()[name], values), name
+
+
+class TestHolesOnly:
+    """Real views train the scene alone, and virtual ones fill its holes."""
+
+    def test_is_one_after_the_other(
+        self, scene: Scene, sequence: EndoscopicSequence, pseudo: PseudoViews
+    ) -> None:
+        holes = replace(pseudo, alpha=np.zeros_like(pseudo.alpha))
+        config = config_of("paper", growth=2.0, seed_holes=True, holes_only=True, rounds=2, iterations=6)
+        whole = finetune(scene, sequence, holes, config, COARSE)
+        alone = finetune(scene, sequence, None, config, COARSE)
+        plain = config.model_copy(update={"holes_only": False})
+        assert_same_scene(alone.scene, finetune(scene, sequence, None, plain, COARSE).scene)
+        filling = plain.model_copy(update={"keep_scene": True, "rounds": 1, "iterations": 3})
+        filled = finetune(alone.scene, sequence, holes, filling, COARSE)
+        assert len(filled.scene.gaussians) > len(alone.scene.gaussians)
+        assert_same_scene(whole.scene, filled.scene)
+        later = [{**entry, "iteration": entry["iteration"] + 6} for entry in filled.history]
+        assert whole.history == [*alone.history, *later]
+
+    def test_progress_is_of_both(
+        self, scene: Scene, sequence: EndoscopicSequence, pseudo: PseudoViews, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        asked: list[Schedule] = []
+
+        def recorded(start: Scene, draw: object, schedule: Schedule, **_: object) -> TrainingResult:
+            asked.append(schedule)
+            return TrainingResult(start, [])
+
+        monkeypatch.setattr(finetuning, "optimise", recorded)
+        holes = replace(pseudo, alpha=np.zeros_like(pseudo.alpha))
+        config = config_of("paper", growth=2.0, seed_holes=True, holes_only=True, iterations=6)
+        finetune(scene, sequence, holes, config, COARSE)
+        spans = [(each.iterations_before, each.iterations, each.iterations_after) for each in asked]
+        assert spans == [(0, 6, 3), (6, 3, 0)]
+        # The light comes to rest on real views, and stays.
+        assert [each.light_cooldown_share for each in asked] == [config.light_cooldown_share, 0]
+        assert [each.light.falloff for each in asked] == [COARSE.light.falloff, False]
+
+
 class TestFirstRound:
     @pytest.mark.parametrize("profile", ["quick", "balanced"])
     def test_has_its_steps_and_its_room(self, profile: str) -> None:
