@@ -159,8 +159,8 @@ def judge_finetuning(
         filled = _filled(arms, scenes[0.0], config, coarse)
         trials.append(replace(_trial(1.0, before, _psnr_of_arms(arms, filled), control), holes_only=True))
     for trial in trials:
-        where = "in_holes" if trial.holes_only else f"{trial.amount:g}"
-        emit(MetricRecorded("finetune", f"left_out_gain_db_at_{where}", trial.gain_db))
+        where = "in_holes" if trial.holes_only else f"at_{trial.amount:g}"
+        emit(MetricRecorded("finetune", f"left_out_gain_db_{where}", trial.gain_db))
     left = np.sort(np.concatenate([arm.left_out for arm in arms]))
     judgement = decide(trials, settings.max_loss_db, left)
     if config.keep_scene:

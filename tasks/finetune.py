@@ -62,6 +62,7 @@ def judge(
     )
     slot.save(judgement)
     slot.counts["amount"] = judgement.amount
+    slot.counts["holes_only"] = int(judgement.holes_only)
 
 
 @stage("finetune", version=25)

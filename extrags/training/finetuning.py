@@ -126,15 +126,15 @@ def finetune(
             found = _round(
                 number,
                 current,
-                remembered if part is parts[-1] else _none,
+                remembered if part is parts[-1] else _no_views,
                 sequence,
                 part,
                 coarse,
                 stage=stage,
                 frame_weights=frame_weights,
                 fixed=fixed,
-                before=before,
-                of=sum(each.iterations for each in parts),
+                iterations_before=before,
+                iterations_in_all=sum(each.iterations for each in parts),
             )
             history += [{**entry, "iteration": entry["iteration"] + before} for entry in found.history]
             before += part.steps_of_rounds[number]
@@ -150,8 +150,8 @@ def _loaded_once(pseudo_views: PseudoViews | None, rounds: int) -> Callable[[], 
     return held.pop
 
 
-def _none() -> None:
-    """Loads no virtual views."""
+def _no_views() -> None:
+    """What real views alone load."""
 
 
 def _round(
@@ -165,13 +165,10 @@ def _round(
     stage: str,
     frame_weights: FrameWeights | None,
     fixed: int,
-    before: int,
-    of: int,
+    iterations_before: int,
+    iterations_in_all: int,
 ) -> TrainingResult:
-    """One round of `finetune`; with `keep_scene` the first `fixed` Gaussians stay as they are.
-
-    It follows the iterations `before` it, `of` all.
-    """
+    """One round of `finetune`; with `keep_scene` the first `fixed` Gaussians stay as they are."""
     frames, last = sequence.train, number == config.rounds - 1
     depth = median_depth(sequence, frames)
     growth = config.growth if last else config.growth_before_last
@@ -219,8 +216,8 @@ def _round(
         schedule,
         photometric_weight=config.photometric_weight,
         light_cooldown_share=cooldown_share,
-        iterations_before=before,
-        iterations_after=of - before - steps,
+        iterations_before=iterations_before,
+        iterations_after=iterations_in_all - iterations_before - steps,
     ).resumed(seed=config.seed)
     if config.keep_scene:
         return optimise(

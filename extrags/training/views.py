@@ -72,6 +72,7 @@ class View:
         """Channels of which the target only tells that they are white or brighter; None without any."""
         if not self.saturating:
             return None
+        # Floats are as far as halfway to the step below.
         return self.rgb >= (SATURATED if self.rgb.dtype == torch.uint8 else (SATURATED - 0.5) / 255)
 
     @property

@@ -224,18 +224,12 @@ class TestHolesOnly:
         assert whole.history == [*alone.history, *later]
 
     def test_progress_is_of_both(
-        self, scene: Scene, sequence: EndoscopicSequence, pseudo: PseudoViews, monkeypatch: pytest.MonkeyPatch
+        self, scene: Scene, sequence: EndoscopicSequence, pseudo: PseudoViews, rounds: list[Run]
     ) -> None:
-        asked: list[Schedule] = []
-
-        def recorded(start: Scene, draw: object, schedule: Schedule, **_: object) -> TrainingResult:
-            asked.append(schedule)
-            return TrainingResult(start, [])
-
-        monkeypatch.setattr(finetuning, "optimise", recorded)
         holes = replace(pseudo, alpha=np.zeros_like(pseudo.alpha))
         config = config_of("paper", growth=2.0, seed_holes=True, holes_only=True, iterations=6)
         finetune(scene, sequence, holes, config, COARSE)
+        asked = [run.schedule for run in rounds]
         spans = [(each.iterations_before, each.iterations, each.iterations_after) for each in asked]
         assert spans == [(0, 6, 3), (6, 3, 0)]
         # The light comes to rest on real views, and stays.

@@ -141,7 +141,7 @@ class TestOneStep:
     def test_what_is_brighter_than_a_saturated_channel_is_as_right(
         self, tube_sequence: EndoscopicSequence, native_kernels: bool
     ) -> None:
-        """By which factor it is brighter makes no difference; what is darker is pulled up."""
+        """It has no gradient; what is darker is pulled up."""
         view = real_views(tube_sequence, tube_sequence.train)[1]
         assert view.frame is not None
         view = replace(view, rgb=torch.full_like(view.rgb, 255), saturating=True, depth_mm=None)
@@ -150,20 +150,20 @@ class TestOneStep:
         schedule = step_schedule()
         density = density_strategy(schedule.densify, 20.0, 30, len(scene.gaussians), seed=0)
         found = {}
-        for factor in (0.3, 30.0, 60.0):
+        for factor in (0.3, 60.0):
             exposure = torch.zeros_like(scene.light.log_exposure)
             exposure[view.frame] = 2 * np.log(factor)
             lit = replace(scene, light=replace(scene.light, log_exposure=exposure))
             step = (NativeStep if native_kernels else AutogradStep)(lit, schedule)
-            observation = step.differentiate(replace(view, weight=view.weight), 7, density)
+            observation = step.differentiate(view, 7, density)
             rendered = observation.rendering.rgb[0].detach()
             if isinstance(step, NativeStep):
                 assert step.direct is not None
                 gradient = step.direct.gradients["sh"][:, 0].clone()
             else:
-                means = step.adam.parameters["sh0"].grad
-                assert means is not None
-                gradient = means[:, 0].clone()
+                of_colors = step.adam.parameters["sh0"].grad
+                assert of_colors is not None
+                gradient = of_colors[:, 0].clone()
             found[factor] = (rendered, gradient)
         darker, brighter = found[0.3][1], found[60.0][1]
         # Descending along it brightens; holes alone are darker than white where all else is brighter.
